@@ -1,0 +1,30 @@
+"""Particle filters taught by building pedestrian trackers.
+
+The library behind the book. A tracker is started on the first frame and updated with each later one:
+
+>>> import pftrack
+>>> scene = pftrack.datasets.load("synthetic-walk")
+>>> tracker = pftrack.ColorParticleFilter(n_particles=100, seed=0)
+>>> boxes = pftrack.track(tracker, scene.frames[:10], scene.boxes[0])
+>>> pftrack.metrics.single_target(boxes, scene.boxes[:10]).n_frames
+10
+"""
+
+from pftrack import color, datasets, metrics, motion, smc
+from pftrack.trackers import CamShiftTracker, ColorParticleFilter, Estimate, MeanShiftTracker, follow, track
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CamShiftTracker",
+    "ColorParticleFilter",
+    "Estimate",
+    "MeanShiftTracker",
+    "color",
+    "datasets",
+    "follow",
+    "metrics",
+    "motion",
+    "smc",
+    "track",
+]

@@ -1,0 +1,259 @@
+"""The ``pftrack`` command: track a target, score a result, fetch footage.
+
+Errors are one line on standard error and exit status 2; an interrupt leaves no half-written file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import csv
+import itertools
+import json
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from pftrack import datasets, metrics, trackers, video
+from pftrack.datasets import registry
+from pftrack.trackers import TRACKERS, Estimate
+from pftrack.trackers.base import MISSING
+
+CSV_COLUMNS = ("frame", "x", "y", "w", "h", "score", "lost")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The words after ``pftrack``; those of the command line if not given.
+
+    Returns
+    -------
+    int
+        Exit status: 0 for success, 2 for an error, 130 for an interrupt.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except (ValueError, OSError) as error:
+        print(f"pftrack: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("pftrack: interrupted; nothing was written", file=sys.stderr)
+        return 130
+    return 0
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser whose errors take one line."""
+
+    def error(self, message: str):
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="pftrack", description="Track pedestrians with particle filters.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    track = commands.add_parser("track", help="follow one target through a film")
+    track.add_argument("source", metavar="SOURCE", help="a dataset id, a video file, or a folder of images")
+    track.add_argument("--box", metavar="X,Y,W,H", help="the target in the first frame, in pixels")
+    track.add_argument("--tracker", default="color-pf", metavar="NAME", help=", ".join(TRACKERS))
+    track.add_argument("--particles", type=int, metavar="N", help="number of particles (100)")
+    track.add_argument("--seed", type=int, metavar="S", help="seed of the random numbers (0)")
+    track.add_argument("--csv", type=Path, metavar="FILE", help=f"write {','.join(CSV_COLUMNS)}, frames from 0")
+    track.add_argument("--video", type=Path, metavar="FILE", help="write an annotated MP4")
+    track.set_defaults(run=_track)
+
+    evaluate = commands.add_parser("evaluate", help="score a result against the truth")
+    evaluate.add_argument("result", type=Path, metavar="RESULT", help="a CSV written by pftrack track")
+    evaluate.add_argument("truth", metavar="TRUTH", help="a dataset id, or a CSV of the same form")
+    evaluate.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    evaluate.set_defaults(run=_evaluate)
+
+    data = commands.add_parser("data", help="list, fetch or locate footage")
+    data.add_argument("action", nargs="?", default="list", choices=["list", "fetch", "path"])
+    data.add_argument("id", nargs="?", metavar="ID", help="a dataset of the list")
+    data.set_defaults(run=_data)
+    return parser
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# pftrack track
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _track(options: argparse.Namespace) -> None:
+    tracker = _make_tracker(options)
+    frames, box, fps = _open_source(options)
+    estimates: list[Estimate] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        """Annotate the frames one by one, collecting the estimates on the way."""
+        ahead, behind = itertools.tee(frames)
+        steps = zip(trackers.follow(tracker, ahead, box), behind, strict=False)
+        for estimate, frame in tqdm(steps, total=len(frames), unit="frame", disable=None):
+            estimates.append(estimate)
+            yield video.annotate(frame, estimate.box, lost=estimate.lost, particles=estimate.particles)
+
+    if options.video:
+        video.write(options.video, pictures(), fps)
+    else:
+        collections.deque(pictures(), maxlen=0)
+    n_unread = len(frames) - len(estimates)
+    estimates += [MISSING] * n_unread
+    if options.csv:
+        write_csv(options.csv, estimates)
+    print(f"{len(estimates)} frames, lost in {sum(estimate.lost for estimate in estimates)}")
+    if n_unread:
+        print(f"the film announces {len(frames)} frames but ends {n_unread} early; those count as lost")
+
+
+def _make_tracker(options: argparse.Namespace) -> trackers.Tracker:
+    if options.tracker not in TRACKERS:
+        raise ValueError(f"unknown tracker {options.tracker!r}; choose one of {', '.join(TRACKERS)}")
+    settings = {"n_particles": options.particles, "seed": options.seed}
+    settings = {name: value for name, value in settings.items() if value is not None}
+    try:
+        return TRACKERS[options.tracker](**settings)
+    except TypeError:
+        raise ValueError(f"{options.tracker} has no particles and no seed") from None
+
+
+def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, np.ndarray, float]:
+    """Return frames, first box and frame rate of a dataset, a video or a folder."""
+    if options.source in datasets.ids():
+        sequence = datasets.load(options.source)
+        frames, fps = sequence.frames, sequence.fps
+        box = sequence.boxes[0] if options.box is None else parse_box(options.box)
+        return frames, box, fps
+    if not Path(options.source).exists():
+        raise FileNotFoundError(
+            f"there is no file, folder or dataset {options.source!r}; the datasets are {', '.join(datasets.ids())}"
+        )
+    frames = datasets.open_frames(options.source)
+    if options.box is None:
+        raise ValueError(f"say where the target is in the first frame of {options.source} with --box X,Y,W,H")
+    return frames, parse_box(options.box), getattr(frames, "fps", 25.0)
+
+
+def parse_box(text: str) -> np.ndarray:
+    """Read a box from ``X,Y,W,H``.
+
+    Raises
+    ------
+    ValueError
+        If the text is not four numbers.
+
+    Examples
+    --------
+    >>> parse_box("10,20,30.5,40")
+    array([10. , 20. , 30.5, 40. ])
+    """
+    try:
+        x, y, w, h = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ValueError(f"--box takes four numbers X,Y,W,H, got {text!r}") from None
+    return np.array([x, y, w, h])
+
+
+def write_csv(path: Path, estimates: Sequence[Estimate]) -> None:
+    """Write estimates as ``frame,x,y,w,h,score,lost``; the file appears only when it is complete.
+
+    Parameters
+    ----------
+    path : path
+        Where to write.
+    estimates : sequence of Estimate
+        One for each frame; a NaN box leaves its four columns empty.
+    """
+    with video.replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(CSV_COLUMNS)
+        for frame, estimate in enumerate(estimates):
+            box = ["" if math.isnan(side) else f"{side:.3f}" for side in estimate.box]
+            writer.writerow([frame, *box, f"{estimate.score:.4f}", int(estimate.lost)])
+
+
+def read_csv(path: Path) -> np.ndarray:
+    """Read the boxes of a CSV written by :func:`write_csv`.
+
+    Returns
+    -------
+    ndarray, shape (T, 4)
+        Boxes ``(x, y, w, h)`` in pixels, NaN where the columns are empty or the frame is absent.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If it has not the columns ``frame,x,y,w,h``.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = {int(row["frame"]): [float(row[side] or "nan") for side in "xywh"] for row in csv.DictReader(file)}
+        boxes = np.full((max(rows) + 1, 4), np.nan)
+        for frame, box in rows.items():
+            boxes[frame] = box
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} is not a CSV with the columns {','.join(CSV_COLUMNS)}") from error
+    return boxes
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# pftrack evaluate, pftrack data
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    boxes = read_csv(options.result)
+    truth = datasets.load(options.truth).boxes if options.truth in datasets.ids() else read_csv(Path(options.truth))
+    if len(boxes) != len(truth):
+        raise ValueError(f"{options.result} has {len(boxes)} frames but {options.truth} has {len(truth)}")
+    score = metrics.single_target(boxes, truth).as_dict()
+    if options.json:
+        print(json.dumps(score, indent=2))
+        return
+    for name, value in score.items():
+        print(f"{name:<20}{value:>10.3f}" if isinstance(value, float) else f"{name:<20}{value:>10}")
+
+
+def _data(options: argparse.Namespace) -> None:
+    if options.action == "list":
+        for entry in registry.ENTRIES.values():
+            print(f"{entry.id:<28}{_where(entry):<16}{entry.title} [{entry.licence}]")
+        for name in datasets.synthetic.SCENES:
+            print(f"{name:<28}{'drawn':<16}synthetic scene with exact truth [BSD-3-Clause]")
+        return
+    if options.id is None:
+        raise ValueError(f"pftrack data {options.action} needs the id of a dataset; pftrack data list shows them")
+    entry = registry.entry(options.id)
+    if options.action == "fetch":
+        files = registry.fetch(entry.id)
+        for path, digest in entry.checksums.items():
+            registry.check_digest(files[path], digest)
+        print(f"{entry.id}: {len(files)} files complete, checksums right")
+        return
+    files, missing = registry.locate(entry.id)
+    if missing:
+        raise FileNotFoundError(f"{entry.id} is not on this machine; pftrack data fetch {entry.id} gets it")
+    print(next(path.parents[len(Path(name).parts) - 1] for name, path in files.items()))
+
+
+def _where(entry: registry.Entry) -> str:
+    if entry.read is None:
+        return "never published"
+    if not registry.locate(entry.id)[1]:
+        return "here"
+    return "by hand" if entry.manual else "to download"

@@ -1,0 +1,24 @@
+"""Single-target trackers, one a file, and their names on the command line."""
+
+from pftrack.trackers.base import Estimate, Tracker, follow, track
+from pftrack.trackers.camshift import CamShiftTracker
+from pftrack.trackers.color_pf import ColorParticleFilter
+from pftrack.trackers.mean_shift import MeanShiftTracker
+
+TRACKERS = {
+    "mean-shift": MeanShiftTracker,
+    "camshift": CamShiftTracker,
+    "color-pf": ColorParticleFilter,
+}
+"""The trackers by name."""
+
+__all__ = [
+    "TRACKERS",
+    "CamShiftTracker",
+    "ColorParticleFilter",
+    "Estimate",
+    "MeanShiftTracker",
+    "Tracker",
+    "follow",
+    "track",
+]
