@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import csv
 import itertools
 import json
 import math
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,16 +41,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit status: 0 for success, 2 for an error, 130 for an interrupt.
     """
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_args(_join_box(sys.argv[1:] if arguments is None else arguments))
     try:
-        options.run(options)
+        with _quiet_libraries():
+            options.run(options)
     except (ValueError, OSError) as error:
         print(f"pftrack: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print("pftrack: this needs more memory than the machine has", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("pftrack: interrupted; nothing was written", file=sys.stderr)
         return 130
     return 0
+
+
+def _join_box(arguments: Sequence[str]) -> list[str]:
+    """Join ``--box -5,20,16,30`` by a ``=``, so that a box that begins with a minus is not taken for an option."""
+    words = [str(word) for word in arguments]
+    for n in reversed(range(len(words) - 1)):
+        if words[n] == "--box":
+            words[n : n + 2] = [f"--box={words[n + 1]}"]
+    return words
+
+
+@contextlib.contextmanager
+def _quiet_libraries() -> Iterator[None]:
+    """Keep what C libraries print about damaged files (FFmpeg, libpng) off standard error, so that errors are one line.
+
+    They write to file descriptor 2; Python's own standard error goes on through a copy of it.
+    """
+    sys.stderr.flush()
+    copy, nowhere, python_stderr = os.dup(2), os.open(os.devnull, os.O_WRONLY), sys.stderr
+    if python_stderr is sys.__stderr__:
+        sys.stderr = os.fdopen(copy, "w", buffering=1, encoding="utf-8", closefd=False)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        sys.stderr.flush()
+        sys.stderr = python_stderr
+        os.dup2(copy, 2)
+        os.close(copy)
+        os.close(nowhere)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -91,6 +127,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _track(options: argparse.Namespace) -> None:
+    for path in filter(None, (options.csv, options.video)):
+        video.check_folder(path)
     tracker = _make_tracker(options)
     frames, box, fps = _open_source(options)
     estimates: list[Estimate] = []
@@ -130,7 +168,7 @@ def _make_tracker(options: argparse.Namespace) -> trackers.Tracker:
 def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, np.ndarray, float]:
     """Return frames, first box and frame rate of a dataset, a video or a folder."""
     if options.source in datasets.ids():
-        sequence = datasets.load(options.source)
+        sequence = _load(options.source)
         frames, fps = sequence.frames, sequence.fps
         box = sequence.boxes[0] if options.box is None else parse_box(options.box)
         return frames, box, fps
@@ -142,6 +180,11 @@ def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, np.ndarr
     if options.box is None:
         raise ValueError(f"say where the target is in the first frame of {options.source} with --box X,Y,W,H")
     return frames, parse_box(options.box), getattr(frames, "fps", 25.0)
+
+
+def _load(id: str) -> datasets.Sequence:
+    """Load a dataset, with a progress bar if somebody is there to see it."""
+    return datasets.load(id, progress=sys.stderr.isatty())
 
 
 def parse_box(text: str) -> np.ndarray:
@@ -203,10 +246,12 @@ def read_csv(path: Path) -> np.ndarray:
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = {int(row["frame"]): [float(row[side] or "nan") for side in "xywh"] for row in csv.DictReader(file)}
+        if min(rows) < 0:
+            raise ValueError("a frame has a negative number")
         boxes = np.full((max(rows) + 1, 4), np.nan)
         for frame, box in rows.items():
             boxes[frame] = box
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, MemoryError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV with the columns {','.join(CSV_COLUMNS)}") from error
     return boxes
 
@@ -218,12 +263,12 @@ def read_csv(path: Path) -> np.ndarray:
 
 def _evaluate(options: argparse.Namespace) -> None:
     boxes = read_csv(options.result)
-    truth = datasets.load(options.truth).boxes if options.truth in datasets.ids() else read_csv(Path(options.truth))
+    truth = _load(options.truth).boxes if options.truth in datasets.ids() else read_csv(Path(options.truth))
     if len(boxes) != len(truth):
         raise ValueError(f"{options.result} has {len(boxes)} frames but {options.truth} has {len(truth)}")
     score = metrics.single_target(boxes, truth).as_dict()
     if options.json:
-        print(json.dumps(score, indent=2))
+        print(json.dumps({name: None if math.isnan(value) else value for name, value in score.items()}, indent=2))
         return
     for name, value in score.items():
         print(f"{name:<20}{value:>10.3f}" if isinstance(value, float) else f"{name:<20}{value:>10}")
@@ -238,14 +283,18 @@ def _data(options: argparse.Namespace) -> None:
         return
     if options.id is None:
         raise ValueError(f"pftrack data {options.action} needs the id of a dataset; pftrack data list shows them")
+    if options.id in datasets.synthetic.SCENES:
+        raise ValueError(f"{options.id} is drawn on demand and needs no files")
     entry = registry.entry(options.id)
     if options.action == "fetch":
-        files = registry.fetch(entry.id)
+        files = registry.fetch(entry.id, progress=sys.stderr.isatty())
         for path, digest in entry.checksums.items():
             registry.check_digest(files[path], digest)
         print(f"{entry.id}: {len(files)} files complete, checksums right")
         return
     files, missing = registry.locate(entry.id)
+    if entry.read is None:
+        raise FileNotFoundError(f"{entry.id} was never published by its authors")
     if missing:
         raise FileNotFoundError(f"{entry.id} is not on this machine; pftrack data fetch {entry.id} gets it")
     print(next(path.parents[len(Path(name).parts) - 1] for name, path in files.items()))

@@ -84,7 +84,8 @@ def pixel_edges(boxes) -> np.ndarray:
     array([[10, 21, 15, 26]])
     """
     boxes = np.asarray(boxes, dtype=float)
-    return np.rint(np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)).astype(int)
+    edges = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+    return np.floor(edges + 0.5).astype(int)  # np.rint rounds halves to even: a box would change its width as it moves
 
 
 def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarray:
@@ -124,6 +125,7 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
     edges = pixel_edges(boxes)
     full_areas = (edges[:, 2] - edges[:, 0]) * (edges[:, 3] - edges[:, 1])
     visible = np.clip(edges, 0, [width, height, width, height])
+    visible[:, 2:] = np.maximum(visible[:, 2:], visible[:, :2])
     visible_areas = (visible[:, 2] - visible[:, 0]) * (visible[:, 3] - visible[:, 1])
     counts = np.zeros((len(edges), N_BINS))
     if visible_areas.any():
@@ -131,8 +133,9 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
         x0, y0 = seen[:, :2].min(axis=0)
         x1, y1 = seen[:, 2:].max(axis=0)
         bins = hsv_bins(frame[y0:y1, x0:x1])  # only the part of the frame that some rectangle covers
-        for n in np.flatnonzero(visible_areas):
-            left, top, right, bottom = visible[n] - [x0, y0, x0, y0]
+        for n, (left, top, right, bottom) in enumerate((visible - [x0, y0, x0, y0]).tolist()):
+            if visible_areas[n] == 0:
+                continue
             counts[n] = cv2.calcHist([bins[top:bottom, left:right]], [0], None, [N_BINS], [0, N_BINS])[:, 0]
     areas = full_areas if outside == "mismatch" else visible_areas
     return counts / np.maximum(areas, 1)[:, None]
@@ -156,7 +159,7 @@ def bhattacharyya(p, q) -> np.ndarray:
     >>> print(bhattacharyya([0.5, 0.5], [0.5, 0.5]), bhattacharyya([1.0, 0.0], [0.0, 1.0]))
     1.0 0.0
     """
-    return np.minimum(np.sqrt(p) @ np.sqrt(np.asarray(q, dtype=float)), 1.0)
+    return np.minimum(np.einsum("...u,...u->...", np.sqrt(p), np.sqrt(q)), 1.0)
 
 
 def hellinger(p, q) -> np.ndarray:
@@ -280,7 +283,8 @@ def masked_histogram(
     Returns
     -------
     ndarray, shape (n_hues, 1), float32
-        The histogram, stretched so that its highest bin is 255; all zeros if the mask admits no pixel.
+        The histogram, stretched so that its lowest bin is 0 and its highest 255; all zeros if the mask admits no pixel
+        or nothing of the box is visible.
 
     Examples
     --------
@@ -290,6 +294,8 @@ def masked_histogram(
     """
     height, width = frame.shape[:2]
     left, top, right, bottom = np.clip(pixel_edges([box])[0], 0, [width, height, width, height])
+    if right <= left or bottom <= top:
+        return np.zeros((n_hues, 1), dtype=np.float32)
     hsv = cv2.cvtColor(frame[top:bottom, left:right], cv2.COLOR_BGR2HSV)
     mask = cv2.inRange(hsv, (0, saturation[0], value[0]), (180, saturation[1], value[1]))
     histogram = cv2.calcHist([hsv], [0], mask, [n_hues], [0, 180])

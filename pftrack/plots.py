@@ -28,6 +28,7 @@ def use_style() -> None:
     """Set Matplotlib's defaults to those of the book; the first code cell of every chapter calls it."""
     plt.rcParams.update(
         {
+            "axes.axisbelow": True,
             "axes.grid": True,
             "axes.prop_cycle": plt.cycler(color=[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, BLACK]),
             "axes.spines.right": False,
@@ -59,8 +60,9 @@ def show_frame(ax: Axes, frame: np.ndarray, title: str = "") -> None:
         What the picture shows.
     """
     image = cv2.cvtColor(frame, cv2.COLOR_BGR2RGB) if frame.ndim == 3 else frame
+    levels = {"vmin": 0, "vmax": 255} if frame.dtype == np.uint8 else {}  # a dim picture stays dim
     height, width = frame.shape[:2]
-    ax.imshow(image, cmap="gray", extent=(0, width, height, 0))
+    ax.imshow(image, cmap="gray", extent=(0, width, height, 0), **levels)
     ax.set(title=title, xlabel="x (pixels)", ylabel="y (pixels)", xlim=(0, width), ylim=(height, 0))
     ax.grid(False)
 
@@ -113,6 +115,13 @@ class Clip:
         Frames a second.
     description : str
         What the film shows, in words; read aloud to those who cannot see it.
+    quality : int
+        As for :func:`pftrack.video.encode`: smaller is better and larger.
+
+    Raises
+    ------
+    ValueError
+        If there are no frames.
 
     Examples
     --------
@@ -121,11 +130,11 @@ class Clip:
     Clip: 3 frames of 64x48 at 25 fps. Grey turns to white.
     """
 
-    def __init__(self, frames, fps: float, description: str):
+    def __init__(self, frames, fps: float, description: str, quality: int = 30):
         frames = list(frames)
+        self.mp4 = encode(frames, fps, quality)
         self.fps, self.description = fps, description
-        self.n_frames, (self.height, self.width) = len(frames), frames[0].shape[:2]
-        self.mp4 = encode(frames, fps)
+        self.n_frames, (self.height, self.width) = len(frames), (side // 2 * 2 for side in frames[0].shape[:2])
         self.poster = cv2.imencode(".jpg", frames[len(frames) // 2], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
     def __repr__(self) -> str:

@@ -28,9 +28,10 @@ def _check_weights(weights) -> np.ndarray:
         raise ValueError(f"weights must be a non-empty one-dimensional array, got shape {weights.shape}")
     if not np.all(weights >= 0):  # also catches NaN
         raise ValueError("weights must not be negative or NaN")
-    if not np.isclose(weights.sum(), 1.0, atol=1e-6):
-        raise ValueError(f"weights must sum to 1, got {weights.sum():.6g}; use normalize on log-weights first")
-    return weights / weights.sum()
+    total = weights.sum()
+    if abs(total - 1.0) > 1e-6:
+        raise ValueError(f"weights must sum to 1, got {total:.6g}; use normalize on log-weights first")
+    return weights / total
 
 
 def _check_log_weights(log_weights) -> np.ndarray:
@@ -448,16 +449,19 @@ def bootstrap_filter(
     states = np.asarray(initial(n_particles, rng), dtype=float)
     if states.ndim != 2 or len(states) != n_particles:
         raise ValueError(f"initial must return shape ({n_particles}, d), got {states.shape}")
-    log_weights = np.full(n_particles, -np.log(n_particles))
+    shape = states.shape
+    equal = np.full(n_particles, -np.log(n_particles))
+    log_weights = equal
     steps = []
     for t, observation in enumerate(observations):
         if t > 0:
             states = np.asarray(transition(states, rng), dtype=float)  # predict
+        if states.shape != shape:
+            raise ValueError(f"at step {t} the transition returned shape {states.shape}, expected {shape}")
         log_likelihoods = np.asarray(log_likelihood(states, observation), dtype=float)
-        if states.shape[0] != n_particles or log_likelihoods.shape != (n_particles,):
+        if log_likelihoods.shape != (n_particles,):
             raise ValueError(
-                f"at step {t} the transition returned shape {states.shape} and log_likelihood shape "
-                f"{log_likelihoods.shape}; expected ({n_particles}, d) and ({n_particles},)"
+                f"at step {t} log_likelihood returned shape {log_likelihoods.shape}, expected ({n_particles},)"
             )
         log_weights = log_weights + log_likelihoods  # update
         increment = log_sum_exp(log_weights)
@@ -469,9 +473,7 @@ def bootstrap_filter(
         updated = states, weights
         if resample:
             states = states[resampler(weights, rng)]
-            weights = np.full(n_particles, 1.0 / n_particles)
-        with np.errstate(divide="ignore"):  # log 0 = -inf is what a weight of zero should be
-            log_weights = np.log(weights)
+        log_weights = equal if resample or np.isneginf(increment) else log_weights - increment
     if not steps:
         raise ValueError("observations is empty")
     means, covariances, sizes, increments, resampled = (np.array(column) for column in zip(*steps, strict=True))

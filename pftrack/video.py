@@ -13,6 +13,8 @@ import av
 import cv2
 import numpy as np
 
+from pftrack.color import pixel_edges
+
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, quality: int) -> None:
     """Encode frames; odd widths and heights lose a row or column, as H.264 needs."""
@@ -23,6 +25,8 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, quality: in
             if stream is None:
                 stream = container.add_stream("libx264", rate=rate, options={"crf": str(quality), "preset": "medium"})
                 stream.height, stream.width = (side // 2 * 2 for side in frame.shape[:2])
+                if min(stream.height, stream.width) == 0:
+                    raise ValueError(f"frames must have at least 2x2 pixels, got {frame.shape[1]}x{frame.shape[0]}")
                 stream.pix_fmt = "yuv420p"
                 stream.thread_count = 1  # the same bytes on every machine
             even = np.ascontiguousarray(frame[: stream.height, : stream.width])
@@ -86,6 +90,19 @@ def write(path: str | os.PathLike, frames: Iterable[np.ndarray], fps: float, qua
         _write_mp4(temporary, frames, fps, quality)
 
 
+def check_folder(path: str | os.PathLike) -> None:
+    """Make sure that a file can be put at `path`: that its folder exists.
+
+    Raises
+    ------
+    FileNotFoundError
+        If it does not.
+    """
+    folder = Path(path).parent
+    if not folder.is_dir():
+        raise FileNotFoundError(f"cannot write {path}: the folder {folder} does not exist")
+
+
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Give a temporary path beside `path`, and rename it to `path` once the block has ended well.
@@ -101,8 +118,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     ['a.txt']
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot write {path}: the folder {path.parent} does not exist")
+    check_folder(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     os.close(handle)
     temporary = Path(name)
@@ -137,10 +153,10 @@ def annotate(frame: np.ndarray, box, *, lost: bool = False, truth=None, particle
     """
     picture = frame.copy()
     if truth is not None and np.isfinite(truth).all():
-        x, y, w, h = np.rint(truth).astype(int)
-        tinted = picture.copy()
-        cv2.rectangle(tinted, (x, y), (x + w, y + h), (178, 114, 0), -1)
-        picture = cv2.addWeighted(tinted, 0.35, picture, 0.65, 0)
+        height, width = frame.shape[:2]
+        left, top, right, bottom = np.clip(pixel_edges([truth])[0], 0, [width, height, width, height])
+        area = picture[top:bottom, left:right]
+        area[:] = 0.65 * area + 0.35 * np.array([178, 114, 0])
     for x, y in np.rint(np.asarray(particles)[:, :2]).astype(int) if particles is not None else ():
         cv2.circle(picture, (int(x), int(y)), 2, (0, 159, 230), -1, cv2.LINE_AA)
     if np.isfinite(box).all():

@@ -100,7 +100,9 @@ class ImageFrames(Frames):
         path = self.paths[index]
         if not path.is_file():
             raise FileNotFoundError(f"the frame {path} does not exist")
-        frame = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        data = path.read_bytes()
+        whole = path.suffix.lower() not in {".jpg", ".jpeg"} or b"\xff\xd9" in data[-64:]  # JPEG's end marker
+        frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data and whole else None
         if frame is None:
             raise ValueError(f"{path} cannot be decoded as an image; it may be damaged or incomplete")
         return frame

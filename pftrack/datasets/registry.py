@@ -332,7 +332,7 @@ def fetch(id: str, progress: bool = True) -> dict[str, Path]:
                 f"{id} is not complete: {path} is not in $PFTRACK_DATA/{id} or {folder}, and downloading it from "
                 f"{address} failed ({type(error).__name__}); if you have the files elsewhere, set PFTRACK_DATA to the "
                 f"folder that holds {id}/"
-            ) from error
+            ) from None  # the chain of network errors would bury the message
     return found
 
 

@@ -199,7 +199,7 @@ def scene(
     camera_motion : float
         Amplitude in pixels of a swaying camera, at most 48.
     growth : float
-        Size of the people in the last frame relative to the first.
+        Size of the people in the last frame relative to the first, from 0.2 to 5.
     birth_death : bool
         Whether people after the first appear and vanish during the film.
     noise : float
@@ -229,10 +229,12 @@ def scene(
     """
     if n_frames < 1 or n_walkers < 1 or distractors < 0 or occlusion < 0:
         raise ValueError("a scene needs at least one frame and one walker, and no negative number of anything")
-    if not 0 <= illumination < 1 or not 0 <= camera_motion <= MARGIN or not growth > 0 or not noise >= 0:
+    if min(size) < 32:
+        raise ValueError(f"size must be at least 32x32 pixels, got {size}")
+    if not 0 <= illumination < 1 or not 0 <= camera_motion <= MARGIN or not 0.2 <= growth <= 5 or not noise >= 0:
         raise ValueError(
-            f"illumination must lie in [0, 1), camera_motion in [0, {MARGIN}], growth above 0 and noise at 0 or above; "
-            f"got {illumination}, {camera_motion}, {growth} and {noise}"
+            f"illumination must lie in [0, 1), camera_motion in [0, {MARGIN}], growth in [0.2, 5] and noise at 0 or "
+            f"above; got {illumination}, {camera_motion}, {growth} and {noise}"
         )
     rng = np.random.default_rng(seed)
     width, height = size
@@ -276,7 +278,7 @@ def scene(
         if visible >= HIDDEN_BELOW
     ]
     title = f"synthetic scene, {n_walkers + distractors} walkers, {n_frames} frames, seed {seed}"
-    return Sequence(name, title, frames, np.array(rows, dtype=float), 25.0, "BSD-3-Clause", "pftrack")
+    return Sequence(name, title, frames, np.array(rows, dtype=float).reshape(-1, 7), 25.0, "BSD-3-Clause", "pftrack")
 
 
 SCENES: dict[str, dict] = {

@@ -16,6 +16,10 @@ MIN_SIDE = 2
 """Smallest width and height, in visible pixels, of a box that a tracker accepts."""
 
 
+LARGEST = 1e6
+"""Largest number, in pixels, that makes sense in a box."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Where a tracker believes its target to be in one frame.
@@ -101,9 +105,13 @@ def check_box(box, frame: np.ndarray) -> np.ndarray:
     ValueError
         If the box has not four finite numbers, is empty, or shows less than 2x2 pixels of the frame.
     """
-    box = np.asarray(box, dtype=float)
-    if box.shape != (4,) or not np.isfinite(box).all():
-        raise ValueError(f"a box must be four finite numbers x, y, w, h in pixels, got {box.tolist()}")
+    given = box
+    try:
+        box = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        box = np.empty(0)
+    if box.shape != (4,) or not np.all(np.abs(box) <= LARGEST):
+        raise ValueError(f"a box must be four finite numbers x, y, w, h in pixels, got {given!r}")
     x, y, w, h = box
     if w <= 0 or h <= 0:
         raise ValueError(f"the box {box.tolist()} is empty; width and height must be positive")

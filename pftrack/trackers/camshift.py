@@ -44,7 +44,7 @@ class CamShiftTracker(MeanShiftTracker):
     rotated_box: tuple | None = None
 
     def init(self, frame: np.ndarray, box) -> Estimate:
-        """Learn the masked hue histogram of the target; see :meth:`~pftrack.trackers.mean_shift.MeanShiftTracker.init`."""
+        """Learn the masked hue histogram of the target; see :class:`~pftrack.trackers.mean_shift.MeanShiftTracker`."""
         self.rotated_box = None
         return super().init(frame, box)
 

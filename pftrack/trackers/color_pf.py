@@ -107,18 +107,24 @@ class ColorParticleFilter:
     ):
         if n_particles < 1:
             raise ValueError(f"n_particles must be at least 1, got {n_particles}")
-        if not sigma > 0:
+        if not isinstance(seed, np.random.Generator) and seed < 0:
+            raise ValueError(f"seed must be a non-negative integer or a Generator, got {seed}")
+        if not 0 < sigma < np.inf:
             raise ValueError(f"sigma must be positive, got {sigma}")
+        if not np.isfinite(dt):
+            raise ValueError(f"dt must be a finite number, got {dt}")
         noise = np.asarray(noise, dtype=float)
-        if noise.shape != (5,) or not np.all(noise >= 0):
-            raise ValueError(f"noise must be five standard deviations, none negative or NaN, got {noise.tolist()}")
+        if noise.shape != (5,) or not np.all((noise >= 0) & np.isfinite(noise)):
+            raise ValueError(
+                f"noise must be five standard deviations, none negative or NaN or infinite, got {noise.tolist()}"
+            )
         if not 0 <= resample_threshold <= 1 or not 0 <= lost_distance <= 1:
             raise ValueError(
                 "resample_threshold and lost_distance must lie between 0 and 1, "
                 f"got {resample_threshold} and {lost_distance}"
             )
         for name, (low, high) in (("scale_range", scale_range), ("scale_limits", scale_limits)):
-            if not 0 < low <= high:
+            if not 0 < low <= high < np.inf:
                 raise ValueError(f"{name} must be an interval above 0, got {(low, high)}")
         if outside not in ("mismatch", "ignore"):
             raise ValueError(f'outside must be "mismatch" or "ignore", got {outside!r}')
@@ -159,9 +165,9 @@ class ColorParticleFilter:
         self.size = box[2:]
         self.noise_in_pixels = self.noise * [box[2], box[2], box[2], box[2], 1.0]
         self.particles = np.tile([*(box[:2] + box[2:] / 2), 0.0, 0.0, 1.0], (self.n_particles, 1))
-        self.weights = np.full(self.n_particles, 1.0 / self.n_particles)
+        self.log_weights = np.zeros(self.n_particles)
         self._shape = frame.shape
-        return Estimate(box=box, score=1.0, lost=False, particles=self.particles, weights=self.weights)
+        return Estimate(box, 1.0, lost=False, particles=self.particles, weights=smc.normalize(self.log_weights))
 
     def update(self, frame: np.ndarray) -> Estimate:
         """Predict, weigh, estimate and, where needed, resample or re-initialise.
@@ -184,7 +190,8 @@ class ColorParticleFilter:
         """
         frame = check_frame(frame, check_started(self._shape))
         particles = self._predict()
-        weights = self._weigh(frame, particles)
+        log_weights = self.log_weights + self._log_likelihood(frame, particles)  # eqs 12 and 13
+        weights = smc.normalize(log_weights)  # eq. 5
         mean = smc.weighted_mean(particles, weights)  # eq. 14
         box = particle_boxes([mean], self.size)[0]
         distance = color.distances(frame, [box], self.target, self.outside)[0]
@@ -193,11 +200,11 @@ class ColorParticleFilter:
         if lost:
             height, width = frame.shape[:2]
             particles = motion.reinitialize(self.n_particles, (width, height), self.rng, self.scale_range)
-            weights = np.full(self.n_particles, 1.0 / self.n_particles)
+            log_weights = np.zeros(self.n_particles)
         elif smc.effective_sample_size(weights) < self.resample_threshold * self.n_particles:
             particles = particles[self.resampler(weights, self.rng)]
-            weights = np.full(self.n_particles, 1.0 / self.n_particles)
-        self.particles, self.weights = particles, weights
+            log_weights = np.zeros(self.n_particles)
+        self.particles, self.log_weights = particles, log_weights
         return estimate
 
     def _predict(self) -> np.ndarray:
@@ -207,12 +214,10 @@ class ColorParticleFilter:
         particles[:, 4] = np.clip(particles[:, 4], *self.scale_limits)
         return particles
 
-    def _weigh(self, frame: np.ndarray, particles: np.ndarray) -> np.ndarray:
-        """Multiply the weights by the likelihood of the colours (eqs 12 and 13) and normalise (eq. 5)."""
+    def _log_likelihood(self, frame: np.ndarray, particles: np.ndarray) -> np.ndarray:
+        """Return how well each particle's rectangle shows the target's colours (eqs 11 and 13)."""
         boxes = particle_boxes(particles, self.size)
-        log_likelihood = color.log_likelihood(frame, boxes, self.target, self.sigma, self.outside)
-        with np.errstate(divide="ignore"):  # a weight of zero has the logarithm -inf
-            return smc.normalize(np.log(self.weights) + log_likelihood)
+        return color.log_likelihood(frame, boxes, self.target, self.sigma, self.outside)
 
     def _is_off_image(self, mean: np.ndarray) -> bool:
         height, width = self._shape[:2]

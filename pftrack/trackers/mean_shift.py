@@ -126,6 +126,6 @@ class MeanShiftTracker:
         return Estimate(box=np.array(self.window, dtype=float), score=0.0 if lost else mass / (255 * w * h), lost=lost)
 
     def _search(self, probability: np.ndarray) -> tuple[int, int, int, int]:
-        """Return the new window ``(x, y, w, h)``; its area is 0 where nothing was found."""
+        """Return the new window ``(x, y, w, h)`` that OpenCV finds."""
         _, window = cv2.meanShift(probability, self.window, self.criteria)
         return window

@@ -1,0 +1,44 @@
+"""Run every chapter from top to bottom and store its outputs: ``python notebooks/execute.py [NOTEBOOK ...]``.
+
+What differs from run to run without meaning anything (times, the kernel's version) is stripped, so that a chapter
+changes in git only when its content does. A chapter that fails is left as it was. The picture of the tracker at work,
+which the README and the first page show, is taken from its chapter.
+"""
+
+import base64
+import sys
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+from tqdm import tqdm
+
+from pftrack.video import replacing
+
+HERE = Path(__file__).parent
+PICTURE = "owczarek-2015-fig-4"
+
+
+def execute(path: Path) -> None:
+    """Run one notebook in place."""
+    notebook = nbformat.read(path, as_version=4)
+    settings = {"timeout": 600, "record_timing": False, "coalesce_streams": True}
+    NotebookClient(notebook, resources={"metadata": {"path": str(HERE)}}, **settings).execute()
+    notebook.metadata.pop("widgets", None)
+    notebook.metadata["language_info"] = {"name": "python"}
+    for number, cell in enumerate(notebook.cells):
+        cell["id"] = f"cell-{number:03d}"
+    nbformat.validate(notebook)
+    with replacing(path) as temporary:
+        nbformat.write(notebook, temporary)
+    for cell in notebook.cells:
+        if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == PICTURE:
+            png = next(output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {}))
+            (HERE.parent / "book" / "_static" / "tracker.png").write_bytes(base64.b64decode(png))
+
+
+if __name__ == "__main__":
+    paths = [Path(name) for name in sys.argv[1:]] or sorted(HERE.glob("[0-9]*.ipynb"))
+    for path in (progress := tqdm(paths, unit="chapter")):
+        progress.set_description(path.name)
+        execute(path)
