@@ -18,8 +18,21 @@ import numpy as np
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm"}
 
 
+class EndOfFilm(ValueError):
+    """A video ended before the number of frames that it announces."""
+
+
 class Frames(Sequence):
     """A lazy list of frames; subclasses say how many there are and how to read one."""
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        """Read the frames in order; a video that ends early ends the iteration."""
+        for index in range(len(self)):
+            try:
+                frame = self.read(index)
+            except EndOfFilm:
+                return
+            yield frame
 
     @abstractmethod
     def read(self, index: int) -> np.ndarray:
@@ -46,6 +59,13 @@ class Selection(Frames):
     def read(self, index: int) -> np.ndarray:
         """Read the frame that the selection holds at this index."""
         return self.frames.read(self.indices[index])
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """List the image files of a folder in the order of their names; nothing if there is no such folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
 class ImageFrames(Frames):
@@ -79,7 +99,7 @@ class ImageFrames(Frames):
         folder = Path(folder)
         if not folder.is_dir():
             raise FileNotFoundError(f"there is no folder {folder}")
-        paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+        paths = image_paths(folder)
         if not paths:
             raise FileNotFoundError(f"the folder {folder} holds no images ({', '.join(sorted(IMAGE_SUFFIXES))})")
         return cls(paths)
@@ -129,7 +149,7 @@ class VideoFrames(Frames):
     Notes
     -----
     The length is what the file announces. A film may end before it; iteration then simply stops, and reading a frame
-    beyond the real end raises ``ValueError``.
+    beyond the real end raises :class:`EndOfFilm`, a ``ValueError``.
     """
 
     def __init__(self, path: str | os.PathLike):
@@ -171,22 +191,13 @@ class VideoFrames(Frames):
     def __len__(self) -> int:
         return self._length
 
-    def __iter__(self) -> Iterator[np.ndarray]:
-        """Decode the film from its beginning to its real end."""
-        for index in range(len(self)):
-            try:
-                frame = self.read(index)
-            except ValueError:
-                return
-            yield frame
-
     def read(self, index: int) -> np.ndarray:
         """Decode up to a frame and return it.
 
         Raises
         ------
-        ValueError
-            If the film ends before that frame.
+        EndOfFilm
+            If the film ends before that frame. It is a ``ValueError``.
         """
         with self._lock:
             if index < self._next:
@@ -194,12 +205,11 @@ class VideoFrames(Frames):
             while self._next < index:
                 self._next += 1
                 if not self._capture.grab():
-                    self._rewind()
-                    raise ValueError(f"{self.path} ends before frame {index}, though it announces {len(self)}")
+                    break
             frame = self._decode()
             if frame is None:
                 self._rewind()
-                raise ValueError(f"{self.path} ends before frame {index}, though it announces {len(self)}")
+                raise EndOfFilm(f"{self.path} ends before frame {index}, though it announces {len(self)}")
             return frame
 
 

@@ -153,16 +153,26 @@ def read_xml(path: str | os.PathLike) -> np.ndarray:
     ValueError
         If it is not XML of this form.
     """
-    rows = []
     try:
-        for frame in ElementTree.fromstring(_text(path)).iter("frame"):
+        frames = list(ElementTree.fromstring(_text(path)).iter("frame"))
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{path} is not a CAVIAR or PETS ground-truth file: {error}") from error
+    if not frames:
+        raise ValueError(f"{path} is not a CAVIAR or PETS ground-truth file: it has no <frame>")
+    rows = []
+    for frame in frames:
+        try:
+            number = int(frame.attrib["number"])
             for item in frame.iterfind("objectlist/object"):
                 box = item.find("box").attrib
                 w, h = float(box["w"]), float(box["h"])
                 x, y = float(box["xc"]) - w / 2, float(box["yc"]) - h / 2
-                rows.append([float(frame.attrib["number"]), float(item.attrib["id"]), x, y, w, h, 1.0])
-    except (ElementTree.ParseError, AttributeError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is not a CAVIAR or PETS ground-truth file: {error}") from error
+                rows.append([number, float(item.attrib["id"]), x, y, w, h, 1.0])
+        except (AttributeError, KeyError, ValueError) as error:
+            raise ValueError(
+                f"{path} is not a CAVIAR or PETS ground-truth file: in frame {frame.get('number')} an object has no "
+                f"readable id or box ({error})"
+            ) from error
     return _table(rows)
 
 

@@ -11,6 +11,7 @@ import hashlib
 import os
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
@@ -23,7 +24,7 @@ from requests.exceptions import RequestException
 from tqdm.auto import tqdm
 
 from pftrack.datasets import readers
-from pftrack.datasets.frames import ImageFrames, VideoFrames
+from pftrack.datasets.frames import ImageFrames, VideoFrames, image_paths
 from pftrack.datasets.sequence import Sequence
 from pftrack.video import replacing
 
@@ -77,6 +78,11 @@ class Entry:
         pairs = (line.split(maxsplit=1) for line in listing.read_text().splitlines())
         return {path: digest for digest, path in pairs}
 
+    def address(self, path: str) -> str | None:
+        """Return the address of the file with this relative path, or None if it has none."""
+        url = next((url for pattern, url in self.sources.items() if fnmatch(path, pattern)), None)
+        return url and url.format(name=Path(path).name)
+
     def sequence(self, frames, tracks, fps: float, detections=None) -> Sequence:
         """Make a sequence that carries this entry's name, title, licence and citation."""
         return Sequence(self.id, self.title, frames, tracks, fps, self.licence, self.citation, detections)
@@ -109,6 +115,8 @@ def _read_pets(entry: Entry, files: dict[str, Path]) -> Sequence:
 
 
 def _read_tud(entry: Entry, files: dict[str, Path]) -> Sequence:
+    if "gt.txt" not in files:
+        raise FileNotFoundError(f"{entry.id} has frames but no truth gt.txt; {entry.manual}")
     detections = readers.read_mot(files["det.txt"]) if "det.txt" in files else None
     return entry.sequence(_images(files), readers.read_mot(files["gt.txt"]), 25.0, detections)
 
@@ -119,7 +127,9 @@ def _read_caviar(entry: Entry, files: dict[str, Path]) -> Sequence:
     numbers = [int(path.stem[-4:]) for path in frames.paths]
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         raise ValueError(f"the frames of {entry.id} are not numbered without gaps")
-    (truth,) = (path for name, path in files.items() if name.endswith(".xml"))
+    truth = next((path for name, path in files.items() if name.endswith(".xml")), None)
+    if truth is None:
+        raise FileNotFoundError(f"{entry.id} has frames but no XML truth; {entry.manual}")
     tracks = readers.read_xml(truth)
     tracks[:, 0] -= numbers[0]
     tracks = tracks[(tracks[:, 0] >= 0) & (tracks[:, 0] < len(numbers))]
@@ -265,9 +275,11 @@ def locate(id: str) -> tuple[dict[str, Path], list[str]]:
     known = entry(id)
     if not known.checksums:  # no list was recorded: take what the folder holds
         for folder in _folders():
-            files = {path.relative_to(folder / id).as_posix(): path for path in (folder / id).rglob("*.*")}
-            if any(name.startswith("frames/") for name in files):
-                return files, []
+            place = folder / id
+            images = {f"frames/{path.name}": path for path in image_paths(place / "frames")}
+            truth = {path.name: path for path in (*place.glob("*.xml"), *place.glob("*.txt"))}
+            if images and truth:
+                return images | truth, []
         return {}, [f"frames/ and the truth of {id}"]
     found, missing = {}, []
     for path in known.checksums:
@@ -314,16 +326,16 @@ def fetch(id: str, progress: bool = True) -> dict[str, Path]:
     for path in tqdm(missing, desc=id, unit="file", disable=not progress):
         if path in found:
             continue  # it came out of an archive
-        address = next((url for pattern, url in known.sources.items() if fnmatch(path, pattern)), None)
+        address = known.address(path)
         if address is None:
             raise FileNotFoundError(
                 f"{id} is not complete: {path} is not in $PFTRACK_DATA/{id} or {folder}, and cannot be downloaded "
                 f"automatically; {known.manual}, below the folder that PFTRACK_DATA names"
             )
-        address = address.format(name=Path(path).name)
         try:
             if address.endswith(".zip"):
-                found |= _retrieve_archive(address, folder, {path: known.checksums[path] for path in missing})
+                inside = {name: known.checksums[name] for name in missing if known.address(name) == address}
+                found |= _retrieve_archive(address, folder, inside)
             else:
                 target = folder / path
                 found[path] = _retrieve(address, target.parent, target.name, known.checksums[path])
@@ -340,7 +352,13 @@ def _retrieve(address: str, folder: Path, name: str, digest: str | None) -> Path
     """Download one file; it appears at its place only when it is complete and its SHA-256 is right."""
     pooch.get_logger().setLevel("ERROR")
     downloader = pooch.HTTPDownloader(timeout=30)
-    return Path(pooch.retrieve(address, digest, fname=name, path=folder, downloader=downloader))
+    try:
+        return Path(pooch.retrieve(address, digest, fname=name, path=folder, downloader=downloader))
+    except ValueError:  # pooch has deleted it
+        raise ValueError(
+            f"{name} from {address} has the wrong SHA-256: the download was incomplete or the file was changed there; "
+            "try again"
+        ) from None
 
 
 def _retrieve_archive(address: str, folder: Path, digests: dict[str, str]) -> dict[str, Path]:
@@ -351,10 +369,11 @@ def _retrieve_archive(address: str, folder: Path, digests: dict[str, str]) -> di
             with zipfile.ZipFile(archive_path) as archive:
                 members = {Path(name).name: name for name in archive.namelist()}
                 for path, digest in digests.items():
+                    (folder / path).parent.mkdir(parents=True, exist_ok=True)
                     with replacing(folder / path) as file:
                         file.write_bytes(archive.read(members[Path(path).name]))
                         check_digest(file, digest, name=f"{path} in {address}")
-        except (zipfile.BadZipFile, KeyError) as error:
+        except (zipfile.BadZipFile, zlib.error, NotImplementedError, KeyError) as error:
             raise ValueError(f"{address} is damaged or not the expected archive ({error}); try again") from error
     return {path: folder / path for path in digests}
 

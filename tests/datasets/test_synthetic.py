@@ -257,8 +257,8 @@ def test_a_walker_walks_straight_across_the_picture_and_stays_in_it():
         ({"illumination": float("nan")}, "illumination must lie in"),
         ({"camera_motion": -1}, "camera_motion in"),
         ({"camera_motion": 49}, "camera_motion in"),
-        ({"growth": 0.0}, "growth above 0"),
-        ({"growth": float("nan")}, "growth above 0"),
+        ({"growth": 0.0}, "growth in"),
+        ({"growth": float("nan")}, "growth in"),
         ({"noise": -1.0}, "noise at 0 or above"),
         ({"noise": float("nan")}, "noise at 0 or above"),
         ({"growth": 0.01}, "growth"),  # walkers of no pixel
