@@ -13,7 +13,7 @@ import nbformat
 from nbclient import NotebookClient
 from tqdm import tqdm
 
-from pftrack.video import replacing
+from pftrack.files import replacing
 
 HERE = Path(__file__).parent
 PICTURE = "owczarek-2015-fig-4"

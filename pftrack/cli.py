@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pftrack import datasets, metrics, trackers, video
+from pftrack import datasets, files, metrics, trackers, video
 from pftrack.datasets import registry
 from pftrack.trackers import TRACKERS, Estimate
 from pftrack.trackers.base import MISSING
@@ -128,7 +128,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _track(options: argparse.Namespace) -> None:
     for path in filter(None, (options.csv, options.video)):
-        video.check_folder(path)
+        files.check_folder(path)
     tracker = _make_tracker(options)
     frames, box, fps = _open_source(options)
     estimates: list[Estimate] = []
@@ -217,7 +217,7 @@ def write_csv(path: Path, estimates: Sequence[Estimate]) -> None:
     estimates : sequence of Estimate
         One for each frame; a NaN box leaves its four columns empty.
     """
-    with video.replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with files.replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(CSV_COLUMNS)
         for frame, estimate in enumerate(estimates):
@@ -287,17 +287,17 @@ def _data(options: argparse.Namespace) -> None:
         raise ValueError(f"{options.id} is drawn on demand and needs no files")
     entry = registry.entry(options.id)
     if options.action == "fetch":
-        files = registry.fetch(entry.id, progress=sys.stderr.isatty())
+        found = registry.fetch(entry.id, progress=sys.stderr.isatty())
         for path, digest in entry.checksums.items():
-            registry.check_digest(files[path], digest)
-        print(f"{entry.id}: {len(files)} files complete, checksums right")
+            registry.check_digest(found[path], digest)
+        print(f"{entry.id}: {len(found)} files complete, checksums right")
         return
-    files, missing = registry.locate(entry.id)
+    found, missing = registry.locate(entry.id)
     if entry.read is None:
         raise FileNotFoundError(f"{entry.id} was never published by its authors")
     if missing:
         raise FileNotFoundError(f"{entry.id} is not on this machine; pftrack data fetch {entry.id} gets it")
-    print(next(path.parents[len(Path(name).parts) - 1] for name, path in files.items()))
+    print(next(path.parents[len(Path(name).parts) - 1] for name, path in found.items()))
 
 
 def _where(entry: registry.Entry) -> str:

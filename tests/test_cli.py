@@ -340,9 +340,15 @@ def test_a_missing_output_folder_is_one_line_and_leaves_nothing(film, out, capfd
     assert list(out.iterdir()) == []
 
 
-def test_an_output_that_is_a_folder_is_one_line_and_leaves_nothing(film, out, capfd):
-    assert run("track", film, "--box", TEXT, "--csv", out) == 2
-    assert_matches("directory", one_line(capfd))
+@pytest.mark.parametrize(
+    "options",
+    [["--csv", "out"], ["--video", "out"], ["--video", "a.mp4", "--csv", "out"]],
+    ids=["csv", "video", "csv after a good video"],
+)
+def test_an_output_that_is_a_folder_is_one_line_and_leaves_nothing(film, out, capfd, options, monkeypatch):
+    monkeypatch.chdir(out.parent)
+    assert run("track", film, "--box", TEXT, *options) == 2
+    assert_matches("directory|folder", one_line(capfd))
     assert list(out.iterdir()) == []
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
@@ -662,6 +668,16 @@ def test_help_goes_to_standard_output(capfd, arguments):
     captured = capfd.readouterr()
     assert captured.out.startswith("usage: pftrack")
     assert captured.err == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell")
+def test_the_command_works_where_standard_error_is_closed():
+    """As under some schedulers and service managers."""
+    code = "import sys; from pftrack.cli import main; sys.exit(main(['data', 'list']))"
+    command = ["sh", "-c", 'exec "$0" -c "$1" 2>&-', sys.executable, code]
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT, check=False)
+    assert result.returncode == 0
+    assert result.stdout.startswith("bobot-I")
 
 
 def test_importing_the_library_and_the_command_draws_in_no_plotting():

@@ -135,40 +135,6 @@ def test_a_film_that_breaks_off_leaves_the_old_one_and_nothing_else(tmp_path, er
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-@pytest.mark.parametrize("error", [ValueError, OSError, KeyboardInterrupt])
-@pytest.mark.parametrize("before", ["old", None], ids=["over a file", "new"])
-def test_replacing_keeps_the_old_file_after_an_error_and_leaves_no_other(tmp_path, error, before):
-    path = tmp_path / "a.txt"
-    if before:
-        path.write_text(before)
-
-    def interrupted():
-        with video.replacing(path) as temporary:
-            temporary.write_text("half")
-            assert temporary.parent == tmp_path  # on the same disk, so that the renaming is one step
-            raise error("stop")
-
-    with pytest.raises(error, match="stop"):
-        interrupted()
-    assert [file.read_text() for file in tmp_path.iterdir()] == ([before] if before else [])
-
-
-def test_until_the_block_ends_the_old_file_is_what_others_read(tmp_path):
-    path = tmp_path / "a.txt"
-    path.write_text("old")
-    with video.replacing(path) as temporary:
-        temporary.write_text("new")
-        assert path.read_text() == "old"
-    assert path.read_text() == "new"
-    assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
-
-
-def test_others_may_read_the_file(tmp_path):
-    with video.replacing(tmp_path / "a.txt") as temporary:
-        temporary.write_text("new")
-    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
-
-
 def test_a_missing_folder_is_named_before_any_work(tmp_path):
     def frames():
         pytest.fail("a frame was asked for")

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from pftrack.video import replacing
+from pftrack.files import replacing
 
 COLUMNS = ("frame", "id", "x", "y", "w", "h", "score")
 """Columns of a table of tracks."""

@@ -26,7 +26,7 @@ from tqdm.auto import tqdm
 from pftrack.datasets import readers
 from pftrack.datasets.frames import ImageFrames, VideoFrames, image_paths
 from pftrack.datasets.sequence import Sequence
-from pftrack.video import replacing
+from pftrack.files import replacing
 
 GITHUB = "https://raw.githubusercontent.com"
 DIPLOM = f"{GITHUB}/sunny-hell/diplom/4f03b46f2bb8eba8ac44e374a4b214cc729c60f7"
