@@ -15,7 +15,7 @@ book: $(VENV)/ready
 test: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pytest -n 2 --dist loadfile --cov --cov-report=term $(ARGS)
+	$(BIN)/pytest -q -n 2 --dist loadfile --cov=pftrack --cov-report=term $(ARGS)
 
 notebooks: $(VENV)/ready
 	$(BIN)/python notebooks/execute.py $(ARGS)

@@ -72,6 +72,9 @@ def _quiet_libraries() -> Iterator[None]:
 
     They write to file descriptor 2; Python's own standard error goes on through a copy of it.
     """
+    if sys.stderr is None:  # closed by the caller
+        yield
+        return
     sys.stderr.flush()
     copy, nowhere, python_stderr = os.dup(2), os.open(os.devnull, os.O_WRONLY), sys.stderr
     if python_stderr is sys.__stderr__:
@@ -127,8 +130,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _track(options: argparse.Namespace) -> None:
-    for path in filter(None, (options.csv, options.video)):
-        files.check_folder(path)
     tracker = _make_tracker(options)
     frames, box, fps = _open_source(options)
     estimates: list[Estimate] = []
@@ -141,14 +142,16 @@ def _track(options: argparse.Namespace) -> None:
             estimates.append(estimate)
             yield video.annotate(frame, estimate.box, lost=estimate.lost, particles=estimate.particles)
 
-    if options.video:
-        video.write(options.video, pictures(), fps)
-    else:
-        collections.deque(pictures(), maxlen=0)
-    n_unread = len(frames) - len(estimates)
-    estimates += [MISSING] * n_unread
-    if options.csv:
-        write_csv(options.csv, estimates)
+    with contextlib.ExitStack() as outputs:  # both files appear, or neither
+        film, table = (path and outputs.enter_context(files.replacing(path)) for path in (options.video, options.csv))
+        if film:
+            video.write(film, pictures(), fps)
+        else:
+            collections.deque(pictures(), maxlen=0)
+        n_unread = len(frames) - len(estimates)
+        estimates += [MISSING] * n_unread
+        if table:
+            write_csv(table, estimates)
     print(f"{len(estimates)} frames, lost in {sum(estimate.lost for estimate in estimates)}")
     if n_unread:
         print(f"the film announces {len(frames)} frames but ends {n_unread} early; those count as lost")

@@ -10,16 +10,20 @@ from pathlib import Path
 
 
 def check_folder(path: str | os.PathLike) -> None:
-    """Make sure that a file can be put at `path`: that its folder exists.
+    """Make sure that a file can be put at `path`: that its folder exists, and that it is none itself.
 
     Raises
     ------
     FileNotFoundError
-        If it does not.
+        If the folder does not exist.
+    IsADirectoryError
+        If `path` is a folder.
     """
     folder = Path(path).parent
     if not folder.is_dir():
         raise FileNotFoundError(f"cannot write {path}: the folder {folder} does not exist")
+    if Path(path).is_dir():
+        raise IsADirectoryError(f"cannot write {path}: it is a folder")
 
 
 @contextlib.contextmanager
@@ -38,6 +42,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """
     path = Path(path)
     check_folder(path)
+    if path.exists() and not path.is_file():  # a device or a pipe, such as /dev/stdout, is written to as it is
+        yield path
+        return
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     os.close(handle)
     temporary = Path(name)

@@ -373,7 +373,7 @@ def _retrieve_archive(address: str, folder: Path, digests: dict[str, str]) -> di
                     with replacing(folder / path) as file:
                         file.write_bytes(archive.read(members[Path(path).name]))
                         check_digest(file, digest, name=f"{path} in {address}")
-        except (zipfile.BadZipFile, zlib.error, NotImplementedError, KeyError) as error:
+        except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, KeyError) as error:
             raise ValueError(f"{address} is damaged or not the expected archive ({error}); try again") from error
     return {path: folder / path for path in digests}
 

@@ -107,7 +107,7 @@ class ColorParticleFilter:
     ):
         if n_particles < 1:
             raise ValueError(f"n_particles must be at least 1, got {n_particles}")
-        if not isinstance(seed, np.random.Generator) and seed < 0:
+        if not (isinstance(seed, np.random.Generator) or (isinstance(seed, (int, np.integer)) and seed >= 0)):
             raise ValueError(f"seed must be a non-negative integer or a Generator, got {seed}")
         if not 0 < sigma < np.inf:
             raise ValueError(f"sigma must be positive, got {sigma}")
