@@ -322,7 +322,6 @@ def fetch(id: str, progress: bool = True) -> dict[str, Path]:
     if not missing:
         return found
     folder = cache_folder() / id
-    folder.mkdir(parents=True, exist_ok=True)
     for path in tqdm(missing, desc=id, unit="file", disable=not progress):
         if path in found:
             continue  # it came out of an archive
