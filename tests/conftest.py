@@ -1,10 +1,12 @@
 """Shared fixtures."""
 
 import os
+from dataclasses import dataclass, field
 
 import pytest
 
 from pftrack import datasets
+from pftrack.datasets import registry
 
 
 @pytest.fixture(scope="session")
@@ -20,3 +22,28 @@ def footage():
         return datasets.load(id)
 
     return load
+
+
+@dataclass(frozen=True)
+class FakeEntry(registry.Entry):
+    """An entry whose checksums are given, not read from the package."""
+
+    sums: dict = field(default_factory=dict)
+
+    @property
+    def checksums(self):
+        return self.sums
+
+
+@pytest.fixture
+def publish(monkeypatch):
+    """Return a function that puts an entry into the registry."""
+
+    def put(sources, sums, id="fake", **fields) -> FakeEntry:
+        entry = FakeEntry(
+            id, "a title", "a licence", "a citation", lambda entry, files: files, sources, sums=sums, **fields
+        )
+        monkeypatch.setitem(registry.ENTRIES, id, entry)
+        return entry
+
+    return put

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import av
@@ -548,35 +547,16 @@ def test_a_truth_that_is_always_hidden_is_one_line(tmp_path, capfd):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FakeEntry(registry.Entry):
-    """An entry whose checksums are given, not read from the package."""
-
-    sums: dict = field(default_factory=dict)
-
-    @property
-    def checksums(self):
-        return self.sums
-
-
 ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # SHA-256 of "abc" (FIPS 180-2)
 
 
 @pytest.fixture
-def fake(tmp_path, monkeypatch):
+def fake(tmp_path, monkeypatch, publish):
     """A dataset of one file, to be put at the returned path, from a server that is not there."""
     monkeypatch.setattr(registry, "cache_folder", lambda: tmp_path / "cache")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    entry = FakeEntry(
-        "fake",
-        "a title",
-        "a licence",
-        "a citation",
-        read=lambda entry, files: files,
-        sources={"*": "http://127.0.0.1:9/{name}"},  # the port of a service that nobody runs
-        sums={"frames/a.txt": ABC},
-    )
-    monkeypatch.setitem(registry.ENTRIES, "fake", entry)
+    nobody = "http://127.0.0.1:9/{name}"  # the port of a service that nobody runs
+    publish({"*": nobody}, {"frames/a.txt": ABC})
     return tmp_path / "cache" / "fake" / "frames" / "a.txt"
 
 

@@ -121,7 +121,8 @@ class ImageFrames(Frames):
         if not path.is_file():
             raise FileNotFoundError(f"the frame {path} does not exist")
         data = path.read_bytes()
-        whole = path.suffix.lower() not in {".jpg", ".jpeg"} or b"\xff\xd9" in data[-64:]  # JPEG's end marker
+        is_jpeg = data.startswith(b"\xff\xd8")  # OpenCV would fill the rest of a half JPEG with grey
+        whole = not is_jpeg or data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")  # the end follows the last scan
         frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data and whole else None
         if frame is None:
             raise ValueError(f"{path} cannot be decoded as an image; it may be damaged or incomplete")

@@ -11,7 +11,6 @@ import re
 import socket
 import threading
 import zipfile
-from dataclasses import dataclass, field
 from importlib import resources
 
 import cv2
@@ -26,17 +25,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:unclosed <socket:ResourceWarning
 
 FETCHED = ("bobot-I", "bobot-J", "pets09-s2l1", "tud-campus", "caviar-walk1")
 UNPUBLISHED = ("li-2012-hall", "li-2012-square", "li-2016-dynamic-background")
-
-
-@dataclass(frozen=True)
-class FakeEntry(registry.Entry):
-    """An entry whose checksums are given, not read from the package."""
-
-    sums: dict = field(default_factory=dict)
-
-    @property
-    def checksums(self):
-        return self.sums
 
 
 def sha256(content: bytes) -> str:
@@ -97,18 +85,6 @@ def server():
         server.shutdown()
         thread.join()
     gc.collect()  # close abandoned sockets here, where their warning is expected, and not in a later test
-
-
-@pytest.fixture
-def publish(monkeypatch):
-    """Return a function that puts an entry into the registry."""
-
-    def put(sources, sums, id="fake", **fields) -> FakeEntry:
-        entry = FakeEntry(id, "title", "licence", "citation", lambda entry, files: files, sources, sums=sums, **fields)
-        monkeypatch.setitem(registry.ENTRIES, id, entry)
-        return entry
-
-    return put
 
 
 def files_in(folder) -> list[str]:
