@@ -11,7 +11,15 @@ The library behind the book. A tracker is started on the first frame and updated
 """
 
 from pftrack import color, datasets, metrics, motion, smc
-from pftrack.trackers import CamShiftTracker, ColorParticleFilter, Estimate, MeanShiftTracker, follow, track
+from pftrack.trackers import (
+    CamShiftTracker,
+    ColorParticleFilter,
+    Estimate,
+    MeanShiftTracker,
+    RobustParticleFilter,
+    follow,
+    track,
+)
 
 __version__ = "0.1.0"
 
@@ -20,6 +28,7 @@ __all__ = [
     "ColorParticleFilter",
     "Estimate",
     "MeanShiftTracker",
+    "RobustParticleFilter",
     "color",
     "datasets",
     "follow",

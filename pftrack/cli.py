@@ -1,4 +1,4 @@
-"""The ``pftrack`` command: track a target, score a result, fetch footage.
+"""The ``pftrack`` command: track a target, score a result, fetch footage, reproduce what the book shows.
 
 Errors are one line on standard error and exit status 2; an interrupt leaves no half-written file.
 """
@@ -15,6 +15,7 @@ import math
 import os
 import sys
 from collections.abc import Iterator, Sequence
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("pftrack: this needs more memory than the machine has", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("pftrack: interrupted; nothing was written", file=sys.stderr)
+        print(f"pftrack: interrupted; {options.interrupted}", file=sys.stderr)
         return 130
     return 0
 
@@ -99,6 +100,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="pftrack", description="Track pedestrians with particle filters.")
+    parser.set_defaults(interrupted="nothing was written")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     track = commands.add_parser("track", help="follow one target through a film")
@@ -121,6 +123,22 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument("action", nargs="?", default="list", choices=["list", "fetch", "path"])
     data.add_argument("id", nargs="?", metavar="ID", help="a dataset of the list")
     data.set_defaults(run=_data)
+
+    reproduce = commands.add_parser("reproduce", help="recompute the tables and figures of the book at full size")
+    reproduce.add_argument(
+        "item",
+        nargs="?",
+        default="all",
+        metavar="TABLE-OR-FIGURE",
+        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, or all of them (the default)",
+    )
+    reproduce.add_argument(
+        "--results", type=Path, default=Path("results"), metavar="DIR", help="where to write (results)"
+    )
+    reproduce.add_argument("--runs", type=int, default=100, metavar="R", help="runs of each setting (100)")
+    reproduce.add_argument("--jobs", type=int, metavar="J", help="worker processes (one for each core)")
+    kept = "what was finished is kept, and the same command goes on from there"
+    reproduce.set_defaults(run=_reproduce, interrupted=kept)
     return parser
 
 
@@ -309,3 +327,19 @@ def _where(entry: registry.Entry) -> str:
     if not registry.locate(entry.id)[1]:
         return "here"
     return "by hand" if entry.manual else "to download"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# pftrack reproduce
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _reproduce(options: argparse.Namespace) -> None:
+    from pftrack import reproduce  # draws in pandas and joblib
+
+    plan = reproduce.Plan(options.results, options.runs, options.jobs, progress=sys.stderr.isatty())
+    try:
+        for path in reproduce.run(options.item, plan):
+            print(path, flush=True)
+    except BrokenExecutor:
+        raise OSError(f"a worker was ended from outside, perhaps for want of memory; {options.interrupted}") from None

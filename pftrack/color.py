@@ -16,6 +16,8 @@ import math
 import cv2
 import numpy as np
 
+from pftrack import kernels
+
 HSV_BINS = (8, 8, 4)
 """Levels of hue, saturation and value."""
 
@@ -60,8 +62,7 @@ def hsv_bins(frame: np.ndarray) -> np.ndarray:
     >>> 32 * 5 + 4 * 7 + 3
     191
     """
-    levels = cv2.LUT(cv2.cvtColor(frame, cv2.COLOR_BGR2HSV), _BIN_TABLE[None])
-    return levels[..., 0] | levels[..., 1] | levels[..., 2]
+    return kernels.bin_image(cv2.cvtColor(frame, cv2.COLOR_BGR2HSV), _BIN_TABLE)
 
 
 def pixel_edges(boxes) -> np.ndarray:
@@ -94,7 +95,7 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
     Parameters
     ----------
     frame : ndarray, shape (H, W, 3), uint8
-        A colour image in BGR order.
+        A colour image in BGR order; or its bin image from :func:`hsv_bins`, shape (H, W), to save computing it again.
     boxes : array_like, shape (N, 4)
         Rectangles ``(x, y, w, h)`` in pixels; they may reach over the image border.
     outside : {"mismatch", "ignore"}
@@ -119,26 +120,38 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
     >>> print(inside, half_out)
     1.0 0.5
     """
+    edges, areas = _regions(frame, boxes, outside)
+    bins, edges = _covered(frame, edges)
+    height, width = bins.shape
+    visible = np.clip(edges, 0, [width, height, width, height])
+    counts = np.zeros((len(edges), N_BINS))
+    for n, (left, top, right, bottom) in enumerate(visible.tolist()):
+        if right > left and bottom > top:
+            counts[n] = cv2.calcHist([bins[top:bottom, left:right]], [0], None, [N_BINS], [0, N_BINS])[:, 0]
+    return counts / areas[:, None]
+
+
+def _regions(frame: np.ndarray, boxes, outside: str) -> tuple[np.ndarray, np.ndarray]:
+    """Whole-pixel edges of boxes, and the number of pixels, at least 1, that their counts are divided by."""
     if outside not in ("mismatch", "ignore"):
         raise ValueError(f'outside must be "mismatch" or "ignore", got {outside!r}')
     height, width = frame.shape[:2]
     edges = pixel_edges(boxes)
-    full_areas = (edges[:, 2] - edges[:, 0]) * (edges[:, 3] - edges[:, 1])
+    counted = edges if outside == "mismatch" else np.clip(edges, 0, [width, height, width, height])
+    return edges, np.maximum(np.prod(counted[:, 2:] - counted[:, :2], axis=1), 1)
+
+
+def _covered(frame: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bin image of only that part of the frame which some rectangle covers, and the edges relative to it."""
+    if frame.ndim == 2:
+        return frame, edges
+    height, width = frame.shape[:2]
     visible = np.clip(edges, 0, [width, height, width, height])
-    visible[:, 2:] = np.maximum(visible[:, 2:], visible[:, :2])
-    visible_areas = (visible[:, 2] - visible[:, 0]) * (visible[:, 3] - visible[:, 1])
-    counts = np.zeros((len(edges), N_BINS))
-    if visible_areas.any():
-        seen = visible[visible_areas > 0]
-        x0, y0 = seen[:, :2].min(axis=0)
-        x1, y1 = seen[:, 2:].max(axis=0)
-        bins = hsv_bins(frame[y0:y1, x0:x1])  # only the part of the frame that some rectangle covers
-        for n, (left, top, right, bottom) in enumerate((visible - [x0, y0, x0, y0]).tolist()):
-            if visible_areas[n] == 0:
-                continue
-            counts[n] = cv2.calcHist([bins[top:bottom, left:right]], [0], None, [N_BINS], [0, N_BINS])[:, 0]
-    areas = full_areas if outside == "mismatch" else visible_areas
-    return counts / np.maximum(areas, 1)[:, None]
+    x0, y0 = visible[:, :2].min(axis=0, initial=max(width, height))
+    x1, y1 = visible[:, 2:].max(axis=0, initial=0)
+    if x1 <= x0 or y1 <= y0:
+        return np.zeros((0, 0), dtype=np.uint8), edges
+    return hsv_bins(frame[y0:y1, x0:x1]), edges - [x0, y0, x0, y0]
 
 
 def bhattacharyya(p, q) -> np.ndarray:
@@ -197,7 +210,7 @@ def distances(frame: np.ndarray, boxes, target: np.ndarray, outside: str = "mism
     Parameters
     ----------
     frame : ndarray, shape (H, W, 3), uint8
-        A colour image in BGR order.
+        A colour image in BGR order; or its bin image from :func:`hsv_bins`, shape (H, W).
     boxes : array_like, shape (N, 4)
         Rectangles ``(x, y, w, h)`` in pixels.
     target : ndarray, shape (256,)
@@ -218,7 +231,9 @@ def distances(frame: np.ndarray, boxes, target: np.ndarray, outside: str = "mism
     >>> print(distances(frame, [[0, 0, 5, 10], [5, 0, 5, 10]], target))
     [0. 1.]
     """
-    return np.sqrt(1.0 - bhattacharyya(histograms(frame, boxes, outside), target))
+    edges, areas = _regions(frame, boxes, outside)
+    bins, edges = _covered(frame, edges)
+    return np.sqrt(1.0 - kernels.similarities(bins, edges, areas, target))
 
 
 def log_likelihood(frame: np.ndarray, boxes, target: np.ndarray, sigma: float, outside: str = "mismatch") -> np.ndarray:

@@ -2,12 +2,14 @@ r"""How a pedestrian may move from one frame to the next: transition models and 
 
 The state of Owczarek et al. 2015 (eq. 8) is :math:`s = [x, y, \dot x, \dot y, k]`: the centre of a rectangle in
 pixels, its velocity in pixels a frame, and its scale relative to the size it had in the first frame. Between frames it
-moves by eq. 9, :math:`s_t = A s_{t-1} + w_{t-1}`, with Gaussian noise :math:`w`. All functions take and return whole
-particle sets, one particle a row. Chapter 5 uses them; chapter 1 uses the same linear model against a Kalman filter.
+moves by eq. 9, :math:`s_t = A s_{t-1} + w_{t-1}`, with Gaussian noise :math:`w`. Functions of particles take and
+return whole sets, one particle a row. Chapter 5 uses them; chapter 1 uses the same linear model against a Kalman
+filter. Where the camera moves too, its motion is measured between frames; chapter 7 uses that.
 """
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 
@@ -150,3 +152,54 @@ def reinitialize(
     low = [0, 0, velocity_range[0], velocity_range[0], scale_range[0]]
     high = [width, height, velocity_range[1], velocity_range[1], scale_range[1]]
     return rng.uniform(low, high, size=(n_particles, 5))
+
+
+def reduced_gray(frame: np.ndarray, width: int = 160) -> np.ndarray:
+    """Make a small grey copy of a frame, for :func:`camera_shift`.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W, 3), uint8
+        A colour image in BGR order.
+    width : int
+        Width of the copy, in pixels.
+
+    Returns
+    -------
+    ndarray, shape (width * H / W, width), uint8
+        The copy, at least 8 pixels high.
+    """
+    size = width, max(8, round(frame.shape[0] * width / frame.shape[1]))
+    return cv2.resize(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
+
+
+def camera_shift(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """How far the background has moved between two frames: the median of the optical flow at a grid of points.
+
+    Most points of a grid lie on the background, so the median is its motion, whatever a few pedestrians do. The flow
+    is that of Lucas and Kanade, by OpenCV.
+
+    Parameters
+    ----------
+    before, after : ndarray, shape (h, w), uint8
+        Two grey images, from :func:`reduced_gray`.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+        Shift along x and y, in pixels of these images; 0 where too few points can be followed.
+
+    Examples
+    --------
+    >>> pattern = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (90, 160), dtype=np.uint8), (0, 0), 3)
+    >>> print(camera_shift(pattern, np.roll(pattern, 2, axis=1))[0].round(1))
+    2.0
+    """
+    height, width = before.shape
+    x, y = np.meshgrid(np.linspace(0.05, 0.95, 8) * width, np.linspace(0.08, 0.92, 6) * height)
+    points = np.stack([x, y], axis=-1).reshape(-1, 1, 2).astype(np.float32)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 8, 0.03)
+    flow = {"winSize": (11, 11), "maxLevel": 2, "criteria": criteria}
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **flow)
+    shifts = (moved - points)[found[:, 0] == 1, 0]
+    return np.median(shifts, axis=0).astype(float) if len(shifts) > 8 else np.zeros(2)

@@ -665,4 +665,4 @@ def test_importing_the_library_and_the_command_draws_in_no_plotting():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, check=True)
     loaded = set(result.stdout.split())
     assert "pftrack.trackers" in loaded
-    assert not {"matplotlib", "ipywidgets", "IPython", "pftrack.plots", "pandas", "scipy", "skimage"} & loaded
+    assert not {"matplotlib", "ipywidgets", "IPython", "pftrack.plots", "pandas", "scipy", "skimage", "joblib"} & loaded

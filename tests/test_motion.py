@@ -1,5 +1,6 @@
 """Transition models and re-initialisation."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy import stats
@@ -111,3 +112,36 @@ def test_reinitialising_repeats_for_a_seed_alone():
 def test_reinitialising_needs_particles_and_an_image(n_particles, image_size):
     with pytest.raises(ValueError, match="at least one particle and an image with area"):
         motion.reinitialize(n_particles, image_size, np.random.default_rng(0))
+
+
+def smooth_noise(height=120, width=200):
+    noise = np.random.default_rng(6).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    return cv2.GaussianBlur(noise, (0, 0), 4) * 2
+
+
+@pytest.mark.parametrize("shift", [(3, 0), (0, -2), (-4, 3)])
+def test_camera_shift_is_how_far_the_background_moved(shift):
+    frame = smooth_noise()
+    before = motion.reduced_gray(frame, 200)
+    after = motion.reduced_gray(np.roll(frame, shift, axis=(1, 0)), 200)
+    np.testing.assert_allclose(motion.camera_shift(before, after), shift, atol=0.3)
+
+
+def test_a_pedestrian_does_not_move_the_camera():
+    frame = smooth_noise()
+    moved = frame.copy()
+    moved[30:100, 80:120] = np.roll(frame, 6, axis=1)[30:100, 80:120]
+    shift = motion.camera_shift(motion.reduced_gray(frame, 200), motion.reduced_gray(moved, 200))
+    np.testing.assert_allclose(shift, 0, atol=0.1)
+
+
+def test_where_nothing_can_be_followed_the_camera_stands():
+    rng = np.random.default_rng(7)
+    before, after = (rng.integers(0, 256, (60, 80), dtype=np.uint8) for _ in range(2))
+    assert np.isfinite(motion.camera_shift(before, after)).all()
+    np.testing.assert_array_equal(motion.camera_shift(np.zeros((9, 9), np.uint8), np.zeros((9, 9), np.uint8)), 0)
+
+
+def test_reduced_gray_has_the_width_asked_for_and_keeps_the_shape_of_the_picture():
+    assert motion.reduced_gray(np.zeros((240, 320, 3), np.uint8)).shape == (120, 160)
+    assert motion.reduced_gray(np.zeros((4, 320, 3), np.uint8)).shape == (8, 160)

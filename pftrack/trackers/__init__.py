@@ -4,11 +4,13 @@ from pftrack.trackers.base import Estimate, Tracker, follow, track
 from pftrack.trackers.camshift import CamShiftTracker
 from pftrack.trackers.color_pf import ColorParticleFilter
 from pftrack.trackers.mean_shift import MeanShiftTracker
+from pftrack.trackers.robust_pf import RobustParticleFilter
 
 TRACKERS = {
     "mean-shift": MeanShiftTracker,
     "camshift": CamShiftTracker,
     "color-pf": ColorParticleFilter,
+    "robust-pf": RobustParticleFilter,
 }
 """The trackers by name."""
 
@@ -18,6 +20,7 @@ __all__ = [
     "ColorParticleFilter",
     "Estimate",
     "MeanShiftTracker",
+    "RobustParticleFilter",
     "Tracker",
     "follow",
     "track",

@@ -49,8 +49,28 @@ MISSING = Estimate(box=np.full(4, np.nan), score=0.0, lost=True)
 """The estimate of a frame that could not be read."""
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """What colour trackers derive from a frame alone, whatever their seed; it stands in for the frame.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Shape of the frame, ``(H, W, 3)``.
+    bins : ndarray, shape (H, W), uint8
+        Histogram bin of every pixel.
+    """
+
+    shape: tuple[int, ...]
+    bins: np.ndarray
+
+
 class Tracker(Protocol):
-    """The protocol of every single-target tracker."""
+    """The protocol of every single-target tracker.
+
+    A tracker may also have ``prepare(frame)``, which computes what depends on the frame alone. `init` and `update` then
+    take what it returns in place of the frame, so that many trackers can share it (:mod:`pftrack.experiments`).
+    """
 
     def init(self, frame: np.ndarray, box) -> Estimate:
         """Start tracking what `box` shows in `frame`."""
@@ -64,7 +84,7 @@ def check_frame(frame, shape: tuple[int, ...] | None = None) -> np.ndarray:
 
     Parameters
     ----------
-    frame : ndarray, shape (H, W, 3), uint8
+    frame : ndarray, shape (H, W, 3), uint8, or Prepared
         A colour image in BGR order.
     shape : tuple of int, optional
         The shape that the first frame had.
@@ -74,13 +94,15 @@ def check_frame(frame, shape: tuple[int, ...] | None = None) -> np.ndarray:
     ValueError
         If the frame is not a three-channel uint8 image, or not of the given shape.
     """
-    if not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
+    if isinstance(frame, Prepared):
+        pass  # its frame was checked
+    elif not isinstance(frame, np.ndarray) or frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
         found = f"shape {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
         raise ValueError(
             f"a frame must be a colour image of shape (H, W, 3), got {found}; convert grey or four-channel images "
             "with cv2.cvtColor first"
         )
-    if frame.dtype != np.uint8:
+    elif frame.dtype != np.uint8:
         raise ValueError(f"a frame must have dtype uint8 with values 0 to 255, got {frame.dtype}")
     if shape is not None and frame.shape != shape:
         raise ValueError(
@@ -125,6 +147,18 @@ def check_box(box, frame: np.ndarray) -> np.ndarray:
             "too few to learn the target's colours from"
         )
     return box
+
+
+def check_seed(seed) -> None:
+    """Make sure that a seed is one.
+
+    Raises
+    ------
+    ValueError
+        If it is neither a non-negative integer nor a generator.
+    """
+    if not (isinstance(seed, np.random.Generator) or (isinstance(seed, (int, np.integer)) and seed >= 0)):
+        raise ValueError(f"seed must be a non-negative integer or a Generator, got {seed}")
 
 
 def check_started(shape) -> tuple[int, ...]:

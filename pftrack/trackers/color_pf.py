@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from pftrack import color, motion, smc
-from pftrack.trackers.base import Estimate, check_box, check_frame, check_started
+from pftrack.trackers.base import Estimate, Prepared, check_box, check_frame, check_seed, check_started
 
 
 def particle_boxes(particles, size) -> np.ndarray:
@@ -37,6 +37,11 @@ def particle_boxes(particles, size) -> np.ndarray:
     particles = np.asarray(particles, dtype=float)
     sizes = particles[:, 4:5] * np.asarray(size, dtype=float)
     return np.concatenate([particles[:, :2] - sizes / 2, sizes], axis=1)
+
+
+def _picture(frame: np.ndarray | Prepared) -> np.ndarray:
+    """Return the bin image where there is one already, else the frame."""
+    return frame.bins if isinstance(frame, Prepared) else frame
 
 
 class ColorParticleFilter:
@@ -107,8 +112,7 @@ class ColorParticleFilter:
     ):
         if n_particles < 1:
             raise ValueError(f"n_particles must be at least 1, got {n_particles}")
-        if not (isinstance(seed, np.random.Generator) or (isinstance(seed, (int, np.integer)) and seed >= 0)):
-            raise ValueError(f"seed must be a non-negative integer or a Generator, got {seed}")
+        check_seed(seed)
         if not 0 < sigma < np.inf:
             raise ValueError(f"sigma must be positive, got {sigma}")
         if not np.isfinite(dt):
@@ -138,6 +142,29 @@ class ColorParticleFilter:
         self.target = None
         self._shape = None
 
+    def prepare(self, frame: np.ndarray) -> Prepared:
+        """Compute what depends on the frame alone: its bin image.
+
+        Trackers that differ in their seed or settings can share it when they see the same film: `init` and `update`
+        take it in place of the frame, with the same result.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (H, W, 3), uint8
+            A frame.
+
+        Returns
+        -------
+        Prepared
+            The bin image.
+
+        Raises
+        ------
+        ValueError
+            If the frame is unusable.
+        """
+        return Prepared(check_frame(frame).shape, color.hsv_bins(frame))
+
     def init(self, frame: np.ndarray, box) -> Estimate:
         """Learn the target's histogram and place all particles on it (eq. 8).
 
@@ -161,7 +188,7 @@ class ColorParticleFilter:
         frame = check_frame(frame)
         box = check_box(box, frame)
         self.rng = np.random.default_rng(self.seed)
-        self.target = color.histograms(frame, [box], outside="ignore")[0]
+        self.target = color.histograms(_picture(frame), [box], outside="ignore")[0]
         self.size = box[2:]
         self.noise_in_pixels = self.noise * [box[2], box[2], box[2], box[2], 1.0]
         self.particles = np.tile([*(box[:2] + box[2:] / 2), 0.0, 0.0, 1.0], (self.n_particles, 1))
@@ -194,7 +221,7 @@ class ColorParticleFilter:
         weights = smc.normalize(log_weights)  # eq. 5
         mean = smc.weighted_mean(particles, weights)  # eq. 14
         box = particle_boxes([mean], self.size)[0]
-        distance = color.distances(frame, [box], self.target, self.outside)[0]
+        distance = color.distances(_picture(frame), [box], self.target, self.outside)[0]
         lost = self._is_off_image(mean) or distance > self.lost_distance
         estimate = Estimate(box, float(1.0 - distance), bool(lost), particles, weights)
         if lost:
@@ -217,7 +244,7 @@ class ColorParticleFilter:
     def _log_likelihood(self, frame: np.ndarray, particles: np.ndarray) -> np.ndarray:
         """Return how well each particle's rectangle shows the target's colours (eqs 11 and 13)."""
         boxes = particle_boxes(particles, self.size)
-        return color.log_likelihood(frame, boxes, self.target, self.sigma, self.outside)
+        return color.log_likelihood(_picture(frame), boxes, self.target, self.sigma, self.outside)
 
     def _is_off_image(self, mean: np.ndarray) -> bool:
         height, width = self._shape[:2]

@@ -1,0 +1,435 @@
+"""The files behind the book: their numbers against plain loops over short scenes, and the command that writes them."""
+
+import dataclasses
+import functools
+import json
+import re
+import socket
+from concurrent.futures import BrokenExecutor
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pftrack
+from pftrack import datasets, experiments, masks, metrics, reproduce
+from pftrack.cli import main
+from pftrack.datasets import registry
+from pftrack.reproduce import Plan
+
+SCENE = "synthetic-occlusion"
+N_FRAMES = 70
+MASKS = np.array([[s_low, 256, v_low, 256] for s_low in range(0, 256, 64) for v_low in range(0, 256, 32)])
+
+
+@functools.cache
+def scene() -> datasets.Sequence:
+    """The beginning of a scene, up to where the target is hidden for some frames, held in memory."""
+    whole = datasets.load(SCENE)
+    part = dataclasses.replace(
+        whole, frames=whole.frames[:N_FRAMES], tracks=whole.tracks[whole.tracks[:, 0] < N_FRAMES]
+    )
+    frames = list(part.frames)
+
+    class Held(datasets.Frames):
+        def __len__(self):
+            return N_FRAMES
+
+        def read(self, index):
+            return frames[index]
+
+    return dataclasses.replace(part, frames=Held())
+
+
+@functools.cache
+def scores(**settings) -> metrics.SingleTargetScore:
+    tracker = pftrack.ColorParticleFilter(**settings)
+    return metrics.single_target(pftrack.track(tracker, scene().frames, scene().boxes[0]), scene().boxes)
+
+
+@functools.cache
+def overlaps(seed: int) -> np.ndarray:
+    """Overlap in each frame of the particle filter with 100 particles."""
+    tracker = pftrack.ColorParticleFilter(n_particles=100, seed=seed)
+    return metrics.overlap(pftrack.track(tracker, scene().frames, scene().boxes[0]), scene().boxes)
+
+
+@pytest.fixture
+def plan(tmp_path, monkeypatch) -> Plan:
+    """A small plan on the short scene, in this process."""
+    short = scene()
+    monkeypatch.setattr(datasets, "load", lambda id, progress=True: short)
+    return Plan(tmp_path / "results", 3, 1, SCENE, (4, 8), MASKS, tmp_path / "store", progress=False)
+
+
+def made(item: str, plan: Plan) -> list[pd.DataFrame]:
+    """The files that an item writes, read back."""
+    return [reproduce.read(path) for path in reproduce.run(item, plan)]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Files
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_can_be_read_by_anybody(tmp_path):
+    table = pd.DataFrame({"name": ["a", "b, c"], "n": [1, 2], "x": [1 / 3, np.nan]})
+    path = reproduce.write(tmp_path / "a.csv", table, tracker="color-pf", noise=(0.1, 0.2))
+    plainly = pd.read_csv(path, comment="#")
+    assert plainly["name"].tolist() == ["a", "b, c"]
+    assert plainly["n"].tolist() == [1, 2]
+    assert plainly["x"].tolist() == pytest.approx([0.333333, np.nan], nan_ok=True, abs=0)
+    read = reproduce.read(path)
+    pd.testing.assert_frame_equal(read, plainly)
+    assert list(read.attrs)[:2] == ["tracker", "noise"]
+    assert read.attrs["noise"] == "(0.1, 0.2)"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.csv"]
+
+
+def test_a_file_says_versions_and_processor_but_not_whose_machine_it_was(tmp_path):
+    path = reproduce.write(tmp_path / "a.csv", pd.DataFrame({"n": [1]}))
+    about = reproduce.read(path).attrs
+    assert list(about) == ["pftrack", "python", "numpy", "opencv", "numba", "processor", "cores"]
+    assert about["numpy"] == np.__version__
+    assert all(re.fullmatch(r"\d+(\.\d+)+.*", about[name]) for name in ("pftrack", "python", "opencv", "numba"))
+    assert int(about["cores"]) >= 1
+    assert about["processor"]
+    assert socket.gethostname() not in about.values()
+    assert str(Path.home()) not in path.read_text()
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
+    path = reproduce.write(tmp_path / "a.csv", pd.DataFrame({"n": [1]}))
+    before = path.read_bytes()
+
+    class Unprintable:
+        def __str__(self):
+            raise ValueError("no words")
+
+    with pytest.raises(ValueError, match="no words"):
+        reproduce.write(path, pd.DataFrame({"n": [2]}), tracker=Unprintable())
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_is_not_there_is_an_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        reproduce.read(tmp_path / "none.csv")
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Spread
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_three_spreads_differ_as_they_should():
+    """Two runs of two visible frames, 0, 4 and 1, 1: worked by hand, with sd(a, b) = |a - b| / √2."""
+    found = reproduce.spread([[0, np.nan, 4], [1, np.nan, 1]])
+    root = np.sqrt(2)
+    assert found == pytest.approx({"mean": 1.5, "runs": 1 / root, "frames": 2 / root, "band": 2 / root})
+
+
+def test_spreads_of_known_variances():
+    """Runs differ by a normal with sd 3, frames by one with sd 2, and each number by one with sd 1."""
+    rng = np.random.default_rng(0)
+    n_runs, n_frames = 400, 500
+    values = (
+        3 * rng.standard_normal((n_runs, 1))
+        + 2 * rng.standard_normal(n_frames)
+        + rng.standard_normal((n_runs, n_frames))
+    )
+    found = reproduce.spread(values)
+    for sense, expected, n in (
+        ("runs", np.hypot(3, 1 / np.sqrt(n_frames)), n_runs),
+        ("frames", np.hypot(2, 1), n_frames),
+        ("band", np.hypot(3, 1), n_runs),
+    ):
+        assert found[sense] == pytest.approx(expected, rel=5 / np.sqrt(2 * n))  # five standard errors
+
+
+def test_one_run_has_no_spread_over_runs():
+    found = reproduce.spread([[1.0, 3.0]])
+    assert np.isnan([found["runs"], found["band"]]).all()
+    assert found["frames"] == pytest.approx(np.sqrt(2))
+    assert np.isnan(reproduce.spread([[1.0], [2.0]])["frames"])
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The items
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_fig3_has_every_run_and_its_mean_and_spread(plan):
+    runs, summary = made("fig3", plan)
+    assert runs[["n_particles", "seed"]].to_numpy().tolist() == [[n, seed] for n in (4, 8) for seed in range(3)]
+    for _, row in runs.iterrows():
+        for name, value in scores(n_particles=int(row["n_particles"]), seed=int(row["seed"])).as_dict().items():
+            assert row[name] == pytest.approx(value, abs=0.51e-6)
+    assert summary["n_particles"].tolist() == [4, 8]
+    for n, (_, row) in zip((4, 8), summary.iterrows(), strict=True):
+        for name in ("overlap_all", "overlap_visible", "hit_ratio_all", "hit_ratio_visible"):
+            values = [getattr(scores(n_particles=n, seed=seed), name) for seed in range(3)]
+            assert row[f"{name}_mean"] == pytest.approx(np.mean(values), abs=0.51e-6)
+            assert row[f"{name}_sd"] == pytest.approx(np.std(values, ddof=1), abs=0.51e-6)
+    assert (summary["ms_min"] > 0).all()
+    assert (summary["ms_min"] <= summary["ms_median"]).all()
+    assert runs.attrs["sequence"] == SCENE
+    assert runs.attrs["sigma"] == "0.1"
+    assert runs.attrs["runs"] == "3"
+    assert "n_particles" not in runs.attrs
+
+
+def test_the_paper_has_at_least_eight_numbers_of_particles():
+    particles = Plan().particles
+    assert len(particles) >= 8
+    assert min(particles) == 10
+    assert max(particles) == 2000
+    assert 100 in particles
+    assert (Plan().n_runs, Plan().sequence) == (100, "bobot-I")
+
+
+def test_fig6b_has_every_frame_and_marks_the_hidden_ones(plan):
+    (table,) = made("fig6b", plan)
+    assert table["frame"].tolist() == list(range(N_FRAMES))
+    rates = np.array([overlaps(seed) for seed in range(3)])
+    hidden = np.isnan(scene().boxes[:, 0])
+    assert 0 < hidden.sum() < N_FRAMES
+    assert table["hidden"].tolist() == hidden.astype(int).tolist()
+    assert table.loc[hidden, ["mean", "sd", "p05", "p95", "hits"]].isna().all(axis=None)
+    seen = table[~hidden]
+    np.testing.assert_allclose(seen["mean"], rates.mean(axis=0)[~hidden], atol=0.51e-6)
+    np.testing.assert_allclose(seen["sd"], rates.std(axis=0, ddof=1)[~hidden], atol=0.51e-6)
+    np.testing.assert_allclose(seen["hits"], (rates >= 1 / 3).mean(axis=0)[~hidden], atol=0.51e-6)
+    low, middle, high = np.sort(rates, axis=0)[:, ~hidden]
+    np.testing.assert_allclose(seen["p05"], low + 0.1 * (middle - low), atol=0.51e-6)  # a twentieth of the way of two
+    np.testing.assert_allclose(seen["p95"], high - 0.1 * (high - middle), atol=0.51e-6)
+
+
+@pytest.fixture(scope="module")
+def by_opencv():
+    """For both trackers, what OpenCV itself finds with every mask: overlaps and iterations."""
+    found = {}
+    for tracker in ("camshift", "mean-shift"):
+        pairs = [masks.run_mask(scene().frames, scene().boxes[0], mask, tracker) for mask in MASKS]
+        rates = np.array([metrics.overlap(windows, scene().boxes) for windows, _ in pairs])
+        found[tracker] = rates, np.array([counts for _, counts in pairs])
+    return found
+
+
+def test_fig6a_has_the_best_masks_and_their_curve(plan, by_opencv):
+    curves, found = made("fig6a", plan)
+    hidden = np.isnan(scene().boxes[:, 0])
+    for tracker, (rates, iterations) in by_opencv.items():
+        counted = np.nan_to_num(rates)
+        rows = found[found["tracker"] == tracker]
+        assert rows["rank"].tolist() == [1, 2, 3]
+        best = [int(np.flatnonzero((mask == MASKS).all(axis=1))[0]) for mask in rows.iloc[:, 2:6].to_numpy()]
+        assert len(set(best)) == 3
+        np.testing.assert_allclose(rows["overlap_all"], np.sort(counted.mean(axis=1))[::-1][:3], atol=0.51e-6)
+        np.testing.assert_allclose(rows["overlap_all"], counted[best].mean(axis=1), atol=0.51e-6)
+        np.testing.assert_allclose(rows["overlap_visible"], rates[best][:, ~hidden].mean(axis=1), atol=0.51e-6)
+        np.testing.assert_allclose(rows["hit_ratio_all"], (counted[best] >= 1 / 3).mean(axis=1), atol=0.51e-6)
+        hits = (rates[best] >= 1 / 3)[:, ~hidden]
+        np.testing.assert_allclose(rows["hit_ratio_visible"], hits.mean(axis=1), atol=0.51e-6)
+        np.testing.assert_allclose(rows["iterations"], iterations[best][:, 1:].mean(axis=1), atol=0.51e-6)
+        name = tracker.replace("-", "_")
+        np.testing.assert_allclose(curves[f"{name}_mean"], rates[best].mean(axis=0), atol=0.51e-6)
+        np.testing.assert_allclose(curves[f"{name}_sd"], rates[best].std(axis=0, ddof=1), atol=0.51e-6)
+    assert curves["hidden"].tolist() == hidden.astype(int).tolist()
+    assert curves.attrs["masks"] == str(len(MASKS))
+
+
+def test_table2_sets_the_paper_beside_ours(plan, by_opencv):
+    (table,) = made("table2", plan)
+    table = table.set_index(["measure", "frames", "sd_over"])
+    assert list(table.loc[("overlap", "all", "runs"), ["paper_camshift_mean", "paper_camshift_sd"]]) == [0.53, 0.06]
+    assert list(table.loc[("overlap", "all", "runs"), ["paper_color-pf_mean", "paper_color-pf_sd"]]) == [0.62, 0.10]
+    assert list(table.loc[("hit_ratio", "all", "runs"), ["paper_camshift_mean", "paper_color-pf_mean"]]) == [0.79, 0.87]
+    assert list(table.loc[("ms_per_frame", "all", "runs"), ["paper_camshift_mean", "paper_color-pf_mean"]]) == [
+        0.73,
+        5.55,
+    ]
+    assert table.loc[("iterations", "all", "runs"), "paper_camshift_mean"] == 1.90
+
+    every = [scores(n_particles=100, seed=seed) for seed in range(3)]
+    for measure in ("overlap", "hit_ratio"):
+        for frames in ("all", "visible"):
+            values = [getattr(score, f"{measure}_{frames}") for score in every]
+            row = table.loc[(measure, frames, "runs")]
+            assert row["color-pf_mean"] == pytest.approx(np.mean(values), abs=0.51e-6)
+            assert row["color-pf_sd"] == pytest.approx(np.std(values, ddof=1), abs=0.51e-6)
+    visible = np.array([overlaps(seed) for seed in range(3)])[:, ~np.isnan(scene().boxes[:, 0])]
+    row = table.loc[("overlap", "visible", "band"), "color-pf_sd"]
+    assert row == pytest.approx(visible.std(axis=0, ddof=1).mean(), abs=0.51e-6)
+    row = table.loc[("overlap", "visible", "frames"), "color-pf_sd"]
+    assert row == pytest.approx(visible.std(axis=1, ddof=1).mean(), abs=0.51e-6)
+
+    floor = metrics.single_target(np.tile(scene().boxes[0], (N_FRAMES, 1)), scene().boxes)
+    assert table.loc[("overlap", "all", "runs"), "floor_mean"] == pytest.approx(floor.overlap_all, abs=0.51e-6)
+    assert table.loc[("hit_ratio", "visible", "runs"), "floor_mean"] == pytest.approx(
+        floor.hit_ratio_visible, abs=0.51e-6
+    )
+
+    for tracker, (rates, iterations) in by_opencv.items():
+        counted = np.nan_to_num(rates)
+        best = np.argsort(-counted.mean(axis=1), stable=True)[:3]
+        row = table.loc[("overlap", "all", "runs")]
+        assert row[f"{tracker}_mean"] == pytest.approx(counted[best].mean(), abs=0.51e-6)
+        assert row[f"{tracker}_sd"] == pytest.approx(counted[best].mean(axis=1).std(ddof=1), abs=0.51e-6)
+        row = table.loc[("iterations", "all", "runs")]
+        assert row[f"{tracker}_mean"] == pytest.approx(iterations[best, 1:].mean(), abs=0.51e-6)
+        assert table.loc[("ms_per_frame", "all", "runs"), f"{tracker}_mean"] > 0
+    assert "ms_per_frame" in table.index.get_level_values("measure")
+    assert table.index.is_unique
+
+
+def test_items_share_their_runs_and_go_on_where_they_stopped(plan, monkeypatch):
+    made("fig6b", plan)
+    monkeypatch.setattr(experiments, "_run_group", lambda *_: pytest.fail("computed again"))
+    first = made("fig6b", plan)[0]
+    table = made("table2", plan)[0].set_index(["measure", "frames", "sd_over"])
+    assert table.loc[("overlap", "visible", "runs"), "color-pf_mean"] == pytest.approx(first["mean"].mean(), abs=1e-6)
+
+
+def test_sensitivity_varies_one_setting_at_a_time():
+    default = experiments.Run("color-pf", SCENE, 0).all_settings
+    tried = reproduce.variations()
+    names = {name for name, *_ in tried}
+    assert {"sigma", "resample_threshold", "lost_distance", "scale_range"} < names
+    assert {"position noise", "velocity noise", "scale noise"} < names
+    for name in names:
+        changes = [settings for other, _, settings in tried if other == name]
+        assert len(changes) >= 4
+        assert len({json.dumps(settings) for settings in changes}) == len(changes)
+        at_default = [settings for settings in changes if default | settings == default]
+        assert len(at_default) == 1
+    for name, factor, settings in tried:
+        assert len(settings) == 1
+        if name.endswith("noise"):
+            ratio = np.divide(settings["noise"], default["noise"])
+            places = {"position noise": [0, 1], "velocity noise": [2, 3], "scale noise": [4]}[name]
+            assert ratio == pytest.approx([factor if place in places else 1 for place in range(5)])
+        else:
+            assert settings == {name: factor}
+        experiments.Run("color-pf", SCENE, 0, settings).make_tracker()  # every value is allowed
+
+
+def test_sensitivity_has_the_mean_and_spread_of_every_value(plan, monkeypatch):
+    tried = [
+        ("sigma", 0.1, {"sigma": 0.1}),
+        ("sigma", 0.2, {"sigma": 0.2}),
+        ("lost_distance", 0.5, {"lost_distance": 0.5}),
+    ]
+    monkeypatch.setattr(reproduce, "variations", lambda: tried)
+    (table,) = made("sensitivity", plan)
+    assert table["setting"].tolist() == ["sigma", "sigma", "lost_distance"]
+    assert table["value"].tolist() == [0.1, 0.2, 0.5]
+    assert table["default"].tolist() == [1, 0, 1]
+    for (_, row), sigma in zip(table.iterrows(), (0.1, 0.2, 0.1), strict=True):
+        values = [scores(sigma=sigma, seed=seed).overlap_all for seed in range(3)]
+        assert row["overlap_all_mean"] == pytest.approx(np.mean(values), abs=0.51e-6)
+        assert row["overlap_all_sd"] == pytest.approx(np.std(values, ddof=1), abs=0.51e-6)
+    assert table.attrs["sigma"] == "0.1"
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The command
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def items(monkeypatch):
+    """Items that only note the plan they get."""
+    plans = []
+
+    def item(name):
+        def write(plan):
+            plans.append((name, plan))
+            return [plan.results / f"{name}.csv"]
+
+        return write
+
+    monkeypatch.setattr(reproduce, "ITEMS", {name: item(name) for name in reproduce.ITEMS})
+    return plans
+
+
+def run(*arguments) -> int:
+    try:
+        return main(["reproduce", *map(str, arguments)])
+    except SystemExit as error:
+        return error.code
+
+
+def test_the_command_does_what_it_is_told(items, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("fig3", "--results", tmp_path / "a" / "b", "--runs", 7, "--jobs", 1) == 0
+    ((name, plan),) = items
+    assert (name, plan.results, plan.n_runs, plan.n_jobs) == ("fig3", tmp_path / "a" / "b", 7, 1)
+    assert capfd.readouterr() == (f"{tmp_path / 'a' / 'b' / 'fig3.csv'}\n", "")
+    items.clear()
+    assert run() == 0
+    assert {name for name, _ in items} >= {"fig3", "fig6a", "fig6b", "table2", "sensitivity"}
+    assert items[0][1] == Plan(progress=items[0][1].progress)
+    assert "results/fig6b.csv" in capfd.readouterr().out.replace("\\", "/")
+
+
+def test_the_help_names_every_item(capfd):
+    assert run("--help") == 0
+    shown = capfd.readouterr().out
+    assert all(name in shown for name in reproduce.ITEMS)
+
+
+def test_work_is_kept_in_the_users_cache(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "cache_folder", lambda: tmp_path / "cache")
+    assert tmp_path / "cache" in Plan().folder.parents
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["fig9"], "unknown item 'fig9'; choose one of .*table2"),
+        (["fig3", "--runs", 0], "number of runs must be at least 1"),
+        (["fig3", "--runs", "many"], "invalid int value"),
+        (["fig6b", "--jobs", 0], "n_jobs"),
+        (["fig3", "--results", __file__], "test_reproduce"),
+    ],
+)
+def test_a_bad_command_is_one_line(arguments, hint, plan, capfd, monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.chdir(tmp_path)
+    assert run(*arguments) == 2
+    output, errors = capfd.readouterr()
+    assert output == ""
+    assert len(errors.splitlines()) == 1
+    assert re.search(hint, errors)
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "hint"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; what was finished is kept, and the same command goes on from there"),
+        (BrokenExecutor("gone"), 2, "want of memory; what was finished is kept"),
+    ],
+)
+def test_an_interruption_says_that_work_is_kept(error, status, hint, monkeypatch, tmp_path, capfd):
+    def stop(plan):
+        raise error
+
+    monkeypatch.setitem(reproduce.ITEMS, "fig3", stop)
+    assert run("fig3", "--results", tmp_path) == status
+    errors = capfd.readouterr().err
+    assert len(errors.splitlines()) == 1
+    assert hint in errors
+
+
+def test_the_command_reproduces_on_the_papers_own_footage(footage, monkeypatch, tmp_path, capfd):
+    sequence = footage("bobot-I")
+    monkeypatch.setattr(registry, "cache_folder", lambda: tmp_path / "cache")
+    assert run("fig6b", "--runs", 1, "--jobs", 1, "--results", tmp_path) == 0
+    table = reproduce.read(tmp_path / "fig6b.csv")
+    assert len(table) == 1017  # Table I of the paper
+    assert table["hidden"].sum() == 23
+    tracker = pftrack.ColorParticleFilter(n_particles=100, seed=0)
+    boxes = pftrack.track(tracker, sequence.frames[:50], sequence.boxes[0])
+    np.testing.assert_allclose(table["mean"][:50], metrics.overlap(boxes, sequence.boxes[:50]), atol=0.51e-6)
