@@ -7,7 +7,8 @@ spread. A :class:`Run` names everything that one run depends on, :func:`grid` li
 Runs that differ in nothing but the seed go through the film side by side: each frame is decoded once for all of them,
 and where a tracker has a method ``prepare``, what it derives from the frame alone (for the colour particle filter the
 bin of every pixel) is computed once as well. Its ``init`` and ``update`` then take what ``prepare(frame)`` returned in
-place of the frame. The boxes are those of :func:`pftrack.track` to the bit, whatever the number of workers.
+place of the frame. The boxes are those of :func:`pftrack.trackers.base.track` to the bit, whatever the number of
+workers.
 
 The work is spread by joblib: over the cores of this machine or, with one line around the same call, over the workers of
 a Dask cluster (``pip install "pftrack[cluster]"``)::
@@ -49,7 +50,7 @@ LARGEST_GROUP = 10
 """Most runs that share a pass through the film, unless said otherwise."""
 
 UPPER_ROOMS = ("cli.py", "explore.py", "masks.py", "plots.py", "reproduce.py", "video.py")
-"""Files of the library that trackers and datasets do not build on: a change of them leaves every box as it is."""
+"""Files that trackers and datasets do not build on, so that a change of them leaves every box as it is."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -64,7 +65,7 @@ class Run:
     Attributes
     ----------
     tracker : str
-        A name in :data:`pftrack.trackers.TRACKERS`.
+        A name in ``pftrack.trackers.TRACKERS``.
     sequence : str
         A dataset id, one of :func:`pftrack.datasets.ids`.
     seed : int or None
@@ -256,8 +257,8 @@ def run(
     Raises
     ------
     ValueError
-        If a run cannot be done (see :class:`Run` and :func:`pftrack.track`), `group_size` is below 1, or a worker has
-        another library than the caller. Groups that were finished before are in the store.
+        If a run cannot be done (see :class:`Run` and :func:`pftrack.trackers.base.track`), `group_size` is below 1, or
+        a worker has another library than the caller. Groups that were finished before are in the store.
     FileNotFoundError
         If footage is not here and cannot be downloaded.
 

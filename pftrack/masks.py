@@ -209,7 +209,7 @@ def search(
     n_best : int
         How many to return; all of them, if there are fewer. Between equals the earlier one comes first.
     n_jobs : int
-        Number of worker processes, as :class:`joblib.Parallel` counts them.
+        Number of worker processes, as ``joblib.Parallel`` counts them.
     store : path, optional
         A folder in which to keep the finished blocks of masks, so that a search that was interrupted goes on where it
         stopped. Blocks of another film, other settings or another version of the code are left alone.

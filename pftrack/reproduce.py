@@ -51,7 +51,7 @@ PAPER = {
     ("ms_per_frame", "camshift"): (0.73, 0.03),
     ("ms_per_frame", "color-pf"): (5.55, 0.00),
 }
-"""Table II of Owczarek et al. 2015: mean and what it prints after ±."""
+"""What the paper prints in its Table II, as the mean and the number after ±."""
 
 SCORES = ("overlap_all", "overlap_visible", "hit_ratio_all", "hit_ratio_visible")
 
