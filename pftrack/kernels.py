@@ -157,7 +157,7 @@ def similarities(bins: np.ndarray, edges, areas, targets) -> np.ndarray:
     numbers[used] = np.arange(len(used))
     left, top = visible[:, :2].min(axis=0)
     right, bottom = visible[:, 2:].max(axis=0)
-    part = np.ascontiguousarray(numbers[bins[top:bottom, left:right]])
+    part = cv2.LUT(bins[top:bottom, left:right], numbers) if right > left and bottom > top else bins[:0, :0]
     visible -= [left, top, left, top]
     run = sweep if _sweep_pays(part, visible, len(used)) else direct
     return np.minimum(run(part, visible, np.maximum(areas, 1.0), roots[:, used].copy()), 1.0)

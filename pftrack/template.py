@@ -119,9 +119,9 @@ class RidgeTemplate:
             new = self._moments(integral, box, self.n_samples)
             self.running = (1 - self.rate) * self.running + self.rate * new
         both = self.anchor * self.first + (1 - self.anchor) * self.running
-        matrix, vector = both[:, :-1], both[:, -1]
-        penalty = self.ridge * np.trace(self.first[:, :-1]) / len(vector)
-        self.coefficients = np.linalg.solve(matrix + penalty * np.eye(len(vector)), vector)
+        diagonal = np.arange(len(both))
+        both[diagonal, diagonal] += self.ridge * self.first[diagonal, diagonal].mean()
+        self.coefficients = np.linalg.solve(both[:, :-1], both[:, -1])
 
     def predict(self, integral: np.ndarray, boxes) -> np.ndarray:
         """Predicted overlap of each of many boxes with the target, about 0 to 1."""

@@ -317,9 +317,11 @@ class RobustParticleFilter:
     def _bands(self, boxes: np.ndarray) -> np.ndarray:
         """Edges of the bands of boxes, shape (N * n_bands, 4), from head to feet."""
         x, y, w, h = boxes.T[..., None]
-        tops = y + h * np.arange(self.n_bands) / self.n_bands
-        bands = x + self.side_margin * w, tops, (1 - 2 * self.side_margin) * w, h / self.n_bands
-        return color.pixel_edges(np.stack(np.broadcast_arrays(*bands), axis=-1).reshape(-1, 4))
+        left, tops = x + self.side_margin * w, y + h * np.arange(self.n_bands) / self.n_bands
+        edges = np.empty((len(boxes), self.n_bands, 4))
+        edges[..., 0], edges[..., 2] = left, left + (1 - 2 * self.side_margin) * w
+        edges[..., 1], edges[..., 3] = tops, tops + h / self.n_bands
+        return np.floor(edges.reshape(-1, 4) + 0.5).astype(int)  # each to the nearest pixel, as color.pixel_edges
 
     def _histograms(self, look: Description, box: np.ndarray) -> np.ndarray:
         """Histogram of each band of one box, shape (n_bands, 256)."""
