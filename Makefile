@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# the tests share the cores by processes; threads on top of them only wait
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: book test notebooks lab clean
 
