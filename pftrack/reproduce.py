@@ -267,9 +267,9 @@ def fig3(plan: Plan) -> list[Path]:
     return [plan.write("fig3-runs.csv", rows, **about), plan.write("fig3.csv", summary, **about)]
 
 
-def _settings(plan: Plan, n_runs: int) -> dict[str, object]:
-    """Return what the file of an item of the particle filter says above its table: the settings at their default."""
-    return {"tracker": "color-pf", **Run("color-pf", plan.sequence, 0).all_settings, "runs": n_runs}
+def _settings(plan: Plan, n_runs: int, tracker: str = "color-pf") -> dict[str, object]:
+    """Return what the file of an item of a particle filter says above its table: the settings at their default."""
+    return {"tracker": tracker, **Run(tracker, plan.sequence, 0).all_settings, "runs": n_runs}
 
 
 def fig6a(plan: Plan) -> list[Path]:
@@ -471,7 +471,7 @@ def ablation(plan: Plan) -> list[Path]:
     scores = experiments.table(runs, plan.run(runs))
     scores["step"] = names
     table = _mean_and_sd(scores, ["step", "sequence", "target"])
-    return [plan.write("ablation.csv", table, **_settings(plan, len(seeds)))]
+    return [plan.write("ablation.csv", table, **_settings(plan, len(seeds), "robust-pf"))]
 
 
 ITEMS = {

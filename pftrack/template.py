@@ -86,6 +86,8 @@ class RidgeTemplate:
 
     Parameters
     ----------
+    rng : numpy.random.Generator
+        Source of the boxes to learn from.
     ridge : float
         Penalty, relative to the mean of the diagonal of `A`; above 0.
     rate : float
