@@ -25,21 +25,6 @@ N_BINS = math.prod(HSV_BINS)
 """Number of histogram bins, 256."""
 
 
-def _bin_table() -> np.ndarray:
-    """Table of shape (256, 3): the part of the bin index that each 8-bit hue, saturation and value contributes.
-
-    The parts occupy bits 5 to 7, 2 to 4 and 0 to 1 of one byte, so a bitwise *or* puts them together.
-    """
-    level = np.arange(256)
-    hue = np.minimum(level * HSV_BINS[0] // 180, HSV_BINS[0] - 1) << 5
-    saturation = level * HSV_BINS[1] // 256 << 2
-    value = level * HSV_BINS[2] // 256
-    return np.stack([hue, saturation, value], axis=1).astype(np.uint8)
-
-
-_BIN_TABLE = _bin_table()
-
-
 def hsv_bins(frame: np.ndarray) -> np.ndarray:
     """Histogram bin of every pixel of a frame (Owczarek et al. 2015, section III-B).
 
@@ -62,7 +47,10 @@ def hsv_bins(frame: np.ndarray) -> np.ndarray:
     >>> 32 * 5 + 4 * 7 + 3
     191
     """
-    return kernels.bin_image(cv2.cvtColor(frame, cv2.COLOR_BGR2HSV), _BIN_TABLE)
+    if frame.size == 0:
+        return np.zeros(frame.shape[:2], dtype=np.uint8)
+    in_one_row = np.ascontiguousarray(frame).reshape(1, -1, 3)  # OpenCV is slow on short rows
+    return kernels.bin_image(cv2.cvtColor(in_one_row, cv2.COLOR_BGR2HSV)).reshape(frame.shape[:2])
 
 
 def pixel_edges(boxes) -> np.ndarray:
@@ -84,8 +72,8 @@ def pixel_edges(boxes) -> np.ndarray:
     >>> pixel_edges([[10.4, 20.6, 5.0, 5.0]])
     array([[10, 21, 15, 26]])
     """
-    boxes = np.asarray(boxes, dtype=float)
-    edges = np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1)
+    edges = np.array(boxes, dtype=float)
+    edges[:, 2:] += edges[:, :2]
     return np.floor(edges + 0.5).astype(int)  # np.rint rounds halves to even: a box would change its width as it moves
 
 
@@ -120,10 +108,14 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
     >>> print(inside, half_out)
     1.0 0.5
     """
-    edges, areas = _regions(frame, boxes, outside)
-    bins, edges = _covered(frame, edges)
+    if outside not in ("mismatch", "ignore"):
+        raise ValueError(f'outside must be "mismatch" or "ignore", got {outside!r}')
+    edges = pixel_edges(boxes)
+    bins, (x0, y0) = covered_bins(frame, edges)
     height, width = bins.shape
-    visible = np.clip(edges, 0, [width, height, width, height])
+    visible = np.clip(edges - [x0, y0, x0, y0], 0, [width, height, width, height])
+    counted = edges if outside == "mismatch" else visible
+    areas = np.maximum(np.prod(counted[:, 2:] - counted[:, :2], axis=1), 1)
     counts = np.zeros((len(edges), N_BINS))
     for n, (left, top, right, bottom) in enumerate(visible.tolist()):
         if right > left and bottom > top:
@@ -131,27 +123,33 @@ def histograms(frame: np.ndarray, boxes, outside: str = "mismatch") -> np.ndarra
     return counts / areas[:, None]
 
 
-def _regions(frame: np.ndarray, boxes, outside: str) -> tuple[np.ndarray, np.ndarray]:
-    """Whole-pixel edges of boxes, and the number of pixels, at least 1, that their counts are divided by."""
-    if outside not in ("mismatch", "ignore"):
-        raise ValueError(f'outside must be "mismatch" or "ignore", got {outside!r}')
-    height, width = frame.shape[:2]
-    edges = pixel_edges(boxes)
-    counted = edges if outside == "mismatch" else np.clip(edges, 0, [width, height, width, height])
-    return edges, np.maximum(np.prod(counted[:, 2:] - counted[:, :2], axis=1), 1)
+def covered_bins(frame: np.ndarray, edges) -> tuple[np.ndarray, tuple[int, int]]:
+    """Bin image of only that part of a frame which some rectangle covers.
 
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W, 3), uint8
+        A colour image in BGR order; or its bin image from :func:`hsv_bins`, shape (H, W), which is returned whole.
+    edges : array_like of int, shape (N, 4)
+        ``(left, top, right, bottom)`` of the rectangles, from :func:`pixel_edges`.
 
-def _covered(frame: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bin image of only that part of the frame which some rectangle covers, and the edges relative to it."""
+    Returns
+    -------
+    bins : ndarray, shape (h, w), uint8
+        The bins of the part, one pixel wider on all sides; empty if no rectangle shows a pixel.
+    origin : tuple of int
+        Position ``(x, y)`` of its first pixel in the frame.
+
+    Examples
+    --------
+    >>> bins, origin = covered_bins(np.zeros((60, 80, 3), dtype=np.uint8), [[10, 10, 20, 30], [15, 20, 22, 40]])
+    >>> bins.shape, origin
+    ((32, 14), (9, 9))
+    """
     if frame.ndim == 2:
-        return frame, edges
-    height, width = frame.shape[:2]
-    visible = np.clip(edges, 0, [width, height, width, height])
-    x0, y0 = visible[:, :2].min(axis=0, initial=max(width, height))
-    x1, y1 = visible[:, 2:].max(axis=0, initial=0)
-    if x1 <= x0 or y1 <= y0:
-        return np.zeros((0, 0), dtype=np.uint8), edges
-    return hsv_bins(frame[y0:y1, x0:x1]), edges - [x0, y0, x0, y0]
+        return frame, (0, 0)
+    left, top, right, bottom = kernels.cover(edges, *frame.shape[:2])
+    return hsv_bins(frame[top:bottom, left:right]), (left, top)
 
 
 def bhattacharyya(p, q) -> np.ndarray:
@@ -231,9 +229,9 @@ def distances(frame: np.ndarray, boxes, target: np.ndarray, outside: str = "mism
     >>> print(distances(frame, [[0, 0, 5, 10], [5, 0, 5, 10]], target))
     [0. 1.]
     """
-    edges, areas = _regions(frame, boxes, outside)
-    bins, edges = _covered(frame, edges)
-    return np.sqrt(1.0 - kernels.similarities(bins, edges, areas, target))
+    edges = pixel_edges(boxes)
+    bins, origin = covered_bins(frame, edges)
+    return np.sqrt(1.0 - kernels.similarities(bins, edges, target, outside, origin))
 
 
 def log_likelihood(frame: np.ndarray, boxes, target: np.ndarray, sigma: float, outside: str = "mismatch") -> np.ndarray:

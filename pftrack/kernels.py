@@ -12,9 +12,17 @@ from __future__ import annotations
 
 import functools
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
+
+ALIKE = 0.998
+"""Squared Bhattacharyya coefficient above which square roots are taken in double precision: the Hellinger distance is
+then so small that the 8th decimal of the coefficient shows in its 6th."""
+
+MANY_DRAWS = 1500
+"""Number of random draws from which a compiled loop is faster than NumPy, though it takes longer to begin."""
 
 N_ORIENTATIONS = 6
 """Number of orientations of a gradient, over half a turn."""
@@ -24,24 +32,267 @@ FLAT = 12.0
 
 
 @functools.cache
-def compiled(loop):
+def _numba():
+    """Import numba, where it can be, and tell it which loops others call."""
+    try:
+        import numba
+    except ImportError:
+        return None
+    weighing = _similarities_loop, _survey_loop, _sweep_pays, _match_loop, _direct_loop, _sweep_loop
+    for loop in (_move_loop, _weigh_loop, *weighing):
+        numba.extending.register_jitable(loop)
+    return numba
+
+
+@functools.cache
+def compiled(loop, reorder: bool = False):
     """Compile a loop with numba, or return None where numba cannot be imported.
 
     Parameters
     ----------
     loop : function
         A function of arrays and numbers that numba can compile.
+    reorder : bool
+        Whether sums may be taken in any order, several terms at once.
 
     Returns
     -------
     function or None
         The compiled function, kept on disk from one run to the next.
     """
-    try:
-        import numba
-    except ImportError:
-        return None
-    return numba.njit(cache=True)(loop)
+    numba = _numba()
+    return numba and numba.njit(cache=True, fastmath={"reassoc", "nsz"} if reorder else False)(loop)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Particles: resampling and moving
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def comb(weights, shifts, n_teeth: int):
+    """Find the ancestors that the teeth of a comb fall on, one in each of equal slices of the cumulative weights.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (N,)
+        Weights, to be normalised; what comes of negative ones or NaN means nothing.
+    shifts : ndarray, shape (n_teeth,) or (1,)
+        Where in its slice each tooth is, or all are: from 0 to below 1.
+    n_teeth : int
+        Number of teeth, at least 1.
+
+    Returns
+    -------
+    ancestors : ndarray of int, shape (n_teeth,)
+        Index of the particle whose share of the cumulative weights holds each tooth, in increasing order.
+    smallest, total : float
+        Smallest and sum of the weights, so that the caller need not look again.
+
+    Raises
+    ------
+    ValueError
+        If an array is empty or has another shape.
+
+    Examples
+    --------
+    >>> comb(np.array([0.25, 0.5, 0.25]), np.array([0.5]), 4)
+    (array([0, 1, 1, 2]), 0.25, 1.0)
+    """
+    if weights.ndim != 1 or weights.size == 0 or n_teeth < 1 or shifts.shape not in ((n_teeth,), (1,)):
+        raise ValueError(f"need weights (N,) and shifts ({n_teeth},) or (1,), got {weights.shape} and {shifts.shape}")
+    run = compiled(_comb_loop) or comb_numpy
+    return run(np.ascontiguousarray(weights, dtype=float), np.ascontiguousarray(shifts, dtype=float), n_teeth)
+
+
+def comb_numpy(weights, shifts, n_teeth):
+    """Twin of the compiled loop of :func:`comb`."""
+    total = weights.sum()
+    teeth = (np.arange(n_teeth) + shifts) * (total / n_teeth)
+    last = np.flatnonzero(weights).max(initial=0)  # rounding must never pick a particle of weight zero
+    ancestors = np.minimum(np.searchsorted(np.cumsum(weights), teeth, side="right"), last)
+    return ancestors, float(weights.min()), float(total)
+
+
+def _comb_loop(weights, shifts, n_teeth):
+    """Count the teeth below each cumulative weight; the ancestor of a tooth is the number of particles it has passed.
+
+    Nowhere is there a branch on the weights: a processor cannot guess how many offspring the next particle has.
+    """
+    smallest, total = weights[0], 0.0
+    for i in range(len(weights)):
+        smallest = min(smallest, weights[i])
+        total += weights[i]
+    passed = np.zeros(n_teeth + 1, dtype=np.int64)  # particles that end below a tooth, but not below the one before
+    teeth_per_weight, cumulative, last = n_teeth / total if total > 0 else 0.0, 0.0, 0
+    for i in range(len(weights)):
+        cumulative += weights[i]
+        last = i if weights[i] > 0 else last
+        position = cumulative * teeth_per_weight
+        tooth = int(position) if 0 <= position < n_teeth else n_teeth
+        shift = shifts[min(tooth, len(shifts) - 1)]
+        tooth += tooth < n_teeth and shift < position - tooth
+        passed[tooth] += 1
+    ancestors = np.empty(n_teeth, dtype=np.int64)
+    n_passed = 0
+    for j in range(n_teeth):
+        n_passed += passed[j]
+        ancestors[j] = min(n_passed, last)
+    return ancestors, smallest, total
+
+
+def move(particles, noise, rng: np.random.Generator, dt: float, scale_limits, size):
+    """Move particles ``[x, y, dx/dt, dy/dt, k]`` and find their pixels (Owczarek et al. 2015, eqs 8 to 10).
+
+    Parameters
+    ----------
+    particles : ndarray, shape (N, 5)
+        Centres in pixels, velocities in pixels a frame, and scales.
+    noise : array_like, shape (5,)
+        Standard deviations of the Gaussian noise, in the same units.
+    rng : numpy.random.Generator
+        Source of randomness.
+    dt : float
+        Time between frames.
+    scale_limits : tuple of float
+        Lowest and highest scale; others are cut to these.
+    size : array_like, shape (2,)
+        Width and height in pixels at scale 1.
+
+    Returns
+    -------
+    particles : ndarray, shape (N, 5)
+        The moved particles; the input is left as it was.
+    edges : ndarray of int, shape (N, 4)
+        ``(left, top, right, bottom)`` of their rectangles, each rounded to the nearest whole pixel.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape.
+
+    Examples
+    --------
+    >>> still, rng = np.zeros(5), np.random.default_rng(0)
+    >>> particles, edges = move(np.array([[10.0, 10.0, 2.0, 0.0, 1.0]]), still, rng, 1.0, (0.2, 5.0), (4.0, 8.0))
+    >>> particles, edges
+    (array([[12., 10.,  2.,  0.,  1.]]), array([[10,  6, 14, 14]]))
+    """
+    particles, noise = np.ascontiguousarray(particles, dtype=float), np.ascontiguousarray(noise, dtype=float)
+    if particles.ndim != 2 or particles.shape[1] != 5 or noise.shape != (5,):
+        raise ValueError(f"need particles (N, 5) and noise (5,), got shapes {particles.shape} and {noise.shape}")
+    settings = noise, float(dt), *map(float, scale_limits), *map(float, size)
+    run = compiled(_draw_and_move_loop)
+    if run is not None and particles.size >= MANY_DRAWS:
+        return run(particles, rng, *settings)
+    run = compiled(_move_loop) or move_numpy
+    return run(particles, rng.standard_normal(particles.shape), *settings)
+
+
+def move_numpy(particles, steps, noise, dt, lowest, highest, width, height):
+    """Twin of the compiled loop of :func:`move`."""
+    moved = particles.copy()
+    moved[:, :2] += dt * particles[:, 2:4]
+    moved += noise * steps
+    moved[:, 4] = moved[:, 4].clip(lowest, highest)
+    sizes = moved[:, 4:] * [width, height]
+    corners = moved[:, :2] - sizes / 2
+    return moved, np.floor(np.hstack([corners, corners + sizes]) + 0.5).astype(np.int64)
+
+
+def _draw_and_move_loop(particles, rng, noise, dt, lowest, highest, width, height):
+    steps = np.empty_like(particles)
+    for n in range(len(particles)):
+        for i in range(5):
+            steps[n, i] = rng.standard_normal()  # the same numbers as NumPy's
+    return _move_loop(particles, steps, noise, dt, lowest, highest, width, height)
+
+
+def _move_loop(particles, steps, noise, dt, lowest, highest, width, height):
+    moved, edges = steps, np.empty((len(particles), 4), dtype=np.int64)  # in place, to stay in the cache
+    for n in range(len(particles)):
+        moved[n, 0] = particles[n, 0] + dt * particles[n, 2] + noise[0] * steps[n, 0]
+        moved[n, 1] = particles[n, 1] + dt * particles[n, 3] + noise[1] * steps[n, 1]
+        moved[n, 2] = particles[n, 2] + noise[2] * steps[n, 2]
+        moved[n, 3] = particles[n, 3] + noise[3] * steps[n, 3]
+        moved[n, 4] = min(max(particles[n, 4] + noise[4] * steps[n, 4], lowest), highest)
+        w, h = moved[n, 4] * width, moved[n, 4] * height
+        left, top = moved[n, 0] - w / 2, moved[n, 1] - h / 2
+        edges[n, 0], edges[n, 1] = math.floor(left + 0.5), math.floor(top + 0.5)
+        edges[n, 2], edges[n, 3] = math.floor(left + w + 0.5), math.floor(top + h + 0.5)
+    return moved, edges
+
+
+def weigh(log_weights, states):
+    """Turn log-weights into weights, and sum up what they say.
+
+    Parameters
+    ----------
+    log_weights : ndarray, shape (N,)
+        Logarithms of the weights, up to a constant; ``-inf`` is a weight of zero.
+    states : ndarray, shape (N, d)
+        The particles.
+
+    Returns
+    -------
+    weights : ndarray, shape (N,)
+        Normalised weights (Owczarek et al. 2015, eq. 5); all equal if all were zero.
+    mean : ndarray, shape (d,)
+        Weighted mean of the states (eqs 6 and 14).
+    n_effective : float
+        Effective sample size (eq. 7, times N).
+    log_total : float
+        Logarithm of the sum of the weights before they were normalised.
+
+    Raises
+    ------
+    ValueError
+        If there are no particles, the shapes do not fit, or a log-weight is NaN or infinitely large.
+
+    Examples
+    --------
+    >>> weights, mean, n_effective, log_total = weigh(np.log([1.0, 3.0]), np.array([[0.0], [4.0]]))
+    >>> print(weights, mean, n_effective, round(np.exp(log_total), 6))
+    [0.25 0.75] [3.] 1.6 4.0
+    """
+    log_weights, states = np.ascontiguousarray(log_weights, dtype=float), np.ascontiguousarray(states, dtype=float)
+    if log_weights.ndim != 1 or states.ndim != 2 or not 0 < len(log_weights) == len(states):
+        raise ValueError(f"need log-weights (N,) and states (N, d), got shapes {log_weights.shape} and {states.shape}")
+    run = compiled(_weigh_loop, reorder=True) or weigh_numpy
+    weights, mean, n_effective, log_total = run(log_weights, states)
+    if not log_total < np.inf:  # also catches NaN
+        raise ValueError("log-weights must not hold NaN or +inf; a weight of zero is -inf")
+    return weights, mean, n_effective, log_total
+
+
+def weigh_numpy(log_weights, states):
+    """Twin of the compiled loop of :func:`weigh`."""
+    largest = log_weights.max()
+    with np.errstate(invalid="ignore"):  # inf - inf, of which the total will tell
+        weights = np.exp(log_weights - largest) if largest > -np.inf else np.ones(len(log_weights))
+    total = weights.sum()
+    weights /= total
+    return weights, weights @ states, 1.0 / (weights @ weights), largest + math.log(total)
+
+
+def _weigh_loop(log_weights, states):
+    n, d = states.shape
+    largest = log_weights[0]
+    for i in range(n):
+        largest = max(largest, log_weights[i])
+    weights = np.ones(n)
+    if largest > -math.inf:
+        for i in range(n):
+            weights[i] = math.exp(log_weights[i] - largest)
+    total = squares = 0.0
+    for i in range(n):
+        total += weights[i]
+    mean = np.zeros(d)
+    for i in range(n):
+        weights[i] /= total
+        squares += weights[i] * weights[i]
+        for j in range(d):
+            mean[j] += weights[i] * states[i, j]
+    return weights, mean, 1.0 / squares, largest + math.log(total)
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -49,51 +300,46 @@ def compiled(loop):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def bin_image(hsv: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Look up the histogram bin of every pixel.
+def bin_image(hsv: np.ndarray) -> np.ndarray:
+    """Histogram bin of every pixel of an HSV image: 8 levels of hue, 8 of saturation, 4 of value.
 
     Parameters
     ----------
     hsv : ndarray, shape (H, W, 3), uint8
-        An image of three channels.
-    table : ndarray, shape (256, 3), uint8
-        The part of the bin that each level of each channel contributes; the parts occupy different bits.
+        OpenCV's 8-bit HSV: hue 0 to 179, saturation and value 0 to 255.
 
     Returns
     -------
     ndarray, shape (H, W), uint8
-        The parts of the three channels put together by a bitwise *or*.
+        ``32 * hue_level + 4 * saturation_level + value_level``, from 0 to 255.
 
     Raises
     ------
     ValueError
-        If an array has the wrong shape or dtype.
+        If the array has the wrong shape or dtype.
 
     Examples
     --------
-    >>> table = np.zeros((256, 3), dtype=np.uint8)
-    >>> table[9] = 1, 2, 4
-    >>> bin_image(np.uint8([[[9, 0, 9], [9, 9, 9]]]), table)
-    array([[5, 7]], dtype=uint8)
+    >>> bin_image(np.uint8([[[0, 0, 0], [22, 31, 63], [23, 32, 64], [179, 255, 255]]]))
+    array([[  0,   0,  37, 255]], dtype=uint8)
     """
-    if hsv.ndim != 3 or hsv.shape[2] != 3 or hsv.dtype != np.uint8 or table.shape != (256, 3):
-        raise ValueError(f"need a (H, W, 3) uint8 image and a (256, 3) table, got {hsv.shape} and {table.shape}")
+    if hsv.ndim != 3 or hsv.shape[2] != 3 or hsv.dtype != np.uint8:
+        raise ValueError(f"need a (H, W, 3) uint8 image, got {hsv.shape} {hsv.dtype}")
     run = compiled(_bin_image_loop) or bin_image_numpy
-    return run(np.ascontiguousarray(hsv), table)
+    return run(np.ascontiguousarray(hsv).reshape(-1)).reshape(hsv.shape[:2])
 
 
-def bin_image_numpy(hsv, table) -> np.ndarray:
+def bin_image_numpy(levels) -> np.ndarray:
     """Twin of the compiled loop of :func:`bin_image`."""
-    levels = cv2.LUT(hsv, table[None])
-    return levels[..., 0] | levels[..., 1] | levels[..., 2]
+    hue, saturation, value = levels.reshape(-1, 3).T
+    return (hue.astype(int) * 8 // 180 << 5 | saturation >> 5 << 2 | value >> 6).astype(np.uint8)
 
 
-def _bin_image_loop(hsv, table):
-    height, width, _ = hsv.shape
-    bins = np.empty((height, width), dtype=np.uint8)
-    for y in range(height):
-        for x in range(width):
-            bins[y, x] = table[hsv[y, x, 0], 0] | table[hsv[y, x, 1], 1] | table[hsv[y, x, 2], 2]
+def _bin_image_loop(levels):
+    bins = np.empty(levels.size // 3, dtype=np.uint8)
+    for i in range(bins.size):
+        hue_level = np.uint16(levels[3 * i]) * np.uint16(365) >> np.uint16(13)  # hue * 8 // 180, without a division
+        bins[i] = np.uint8(hue_level << 5) | levels[3 * i + 1] >> 5 << 2 | levels[3 * i + 2] >> 6
     return bins
 
 
@@ -102,7 +348,67 @@ def _bin_image_loop(hsv, table):
 # ---------------------------------------------------------------------------------------------------------------------
 
 
-def similarities(bins: np.ndarray, edges, areas, targets) -> np.ndarray:
+@dataclass(frozen=True)
+class Palette:
+    """The bins that targets have pixels in; no other bin adds anything to a Bhattacharyya coefficient.
+
+    Attributes
+    ----------
+    histograms : ndarray, shape (B, 256)
+        Normalised histograms, one a target.
+    used : ndarray of int, shape (K,)
+        The bins in which some target has pixels, in increasing order.
+    numbers : ndarray, shape (256,), uint8
+        Place of every bin in `used`; K for all the others.
+    roots : ndarray, shape (B, P)
+        Square roots of the histograms at `used`, followed by zeros: P is a multiple of 16, above K where it can be, so
+        that other bins can be counted too and processors have whole registers to work on.
+    """
+
+    histograms: np.ndarray
+    used: np.ndarray
+    numbers: np.ndarray
+    roots: np.ndarray
+
+
+def palette(targets) -> Palette:
+    """Prepare target histograms for :func:`similarities`, once for all frames.
+
+    Parameters
+    ----------
+    targets : array_like, shape (256,) or (B, 256)
+        Normalised histograms.
+
+    Returns
+    -------
+    Palette
+        Their bins.
+
+    Raises
+    ------
+    ValueError
+        If the histograms have another number of bins, or are negative or NaN.
+
+    Examples
+    --------
+    >>> target = np.zeros(256)
+    >>> target[[7, 9]] = 0.25, 0.75
+    >>> colors = palette(target)
+    >>> colors.used, colors.numbers[[0, 7, 8, 9]], colors.roots.shape
+    (array([7, 9]), array([2, 0, 2, 1], dtype=uint8), (1, 16))
+    """
+    histograms = np.atleast_2d(np.asarray(targets, dtype=float))
+    if histograms.ndim != 2 or histograms.shape[1] != 256 or not np.all(histograms >= 0):
+        raise ValueError(f"targets must be histograms of 256 bins, none negative or NaN, got shape {histograms.shape}")
+    used = np.flatnonzero(histograms.any(axis=0))
+    numbers = np.full(256, min(len(used), 255), dtype=np.uint8)
+    numbers[used] = np.arange(len(used))
+    roots = np.zeros((len(histograms), min(len(used) // 16 * 16 + 16, 256)))
+    roots[:, : len(used)] = np.sqrt(histograms[:, used])
+    return Palette(histograms, used, numbers, roots)
+
+
+def similarities(bins: np.ndarray, edges, targets, outside: str = "mismatch", origin=(0, 0)) -> np.ndarray:
     r"""Bhattacharyya coefficient of each of many rectangles of a bin image with a target histogram.
 
     .. math:: \rho_m = \sum_u \sqrt{\frac{n_m(u)}{a_m}\, q_{m \bmod B}(u)}
@@ -110,14 +416,16 @@ def similarities(bins: np.ndarray, edges, areas, targets) -> np.ndarray:
     Parameters
     ----------
     bins : ndarray, shape (H, W), uint8
-        Histogram bin of every pixel, from :func:`pftrack.color.hsv_bins`.
+        Histogram bin of every pixel, from :func:`bin_image`.
     edges : array_like of int, shape (M, 4)
-        ``(left, top, right, bottom)`` of each rectangle, right and bottom exclusive; only what lies inside the image
-        is counted.
-    areas : array_like, shape (M,)
-        Number `a` that the counts of each rectangle are divided by, in pixels.
-    targets : array_like, shape (B, 256)
+        ``(left, top, right, bottom)`` of each rectangle, right and bottom exclusive; only pixels of `bins` are counted.
+    targets : Palette, or array_like, shape (B, 256)
         Normalised histograms `q`; rectangle `m` is compared with the one numbered ``m % B``.
+    outside : {"mismatch", "ignore"}
+        Whether the counts are divided by the full area of a rectangle, so that pixels outside count as a colour no
+        target has, or by the area inside.
+    origin : tuple of int
+        Position ``(x, y)`` of the first pixel of `bins`, where they are a part of the frame.
 
     Returns
     -------
@@ -127,120 +435,357 @@ def similarities(bins: np.ndarray, edges, areas, targets) -> np.ndarray:
     Raises
     ------
     ValueError
-        If an array has the wrong shape or dtype.
+        If an array has the wrong shape or dtype, or `outside` is another word.
 
     Examples
     --------
     >>> bins = np.array([[7, 7, 9, 9]], dtype=np.uint8)
-    >>> target = np.zeros((1, 256))
-    >>> target[0, 7] = 1.0
-    >>> similarities(bins, [[0, 0, 2, 1], [1, 0, 3, 1], [2, 0, 4, 1]], [2, 2, 2], target).round(3)
+    >>> target = np.zeros(256)
+    >>> target[7] = 1.0
+    >>> similarities(bins, [[0, 0, 2, 1], [1, 0, 3, 1], [2, 0, 4, 1]], target).round(3)
     array([1.   , 0.707, 0.   ])
     """
+    _check_bins(bins, outside)
+    edges = _check_edges(edges)
+    colors = targets if isinstance(targets, Palette) else palette(targets)
+    whole = outside == "mismatch"
+    run = compiled(_similarities_loop, reorder=True)
+    if run is None:
+        return similarities_numpy(bins, edges - [*origin, *origin], colors.histograms, whole)
+    return run(np.ascontiguousarray(bins), edges, origin, colors.used, colors.numbers, colors.roots, whole)
+
+
+def cover(edges, height: int, width: int) -> tuple[int, int, int, int]:
+    """Smallest part of an image that shows all that rectangles show of it, and one pixel more on each side.
+
+    Parameters
+    ----------
+    edges : array_like of int, shape (M, 4)
+        ``(left, top, right, bottom)`` of each rectangle, right and bottom exclusive.
+    height, width : int
+        Size of the image.
+
+    Returns
+    -------
+    tuple of int
+        ``(left, top, right, bottom)`` of the part; of no width or height if nothing is visible.
+
+    Raises
+    ------
+    ValueError
+        If `edges` has the wrong shape.
+
+    Examples
+    --------
+    >>> cover([[-3, 4, 2, 9], [10, 5, 12, 8]], height=100, width=100)
+    (0, 3, 13, 10)
+    """
+    edges = _check_edges(edges)
+    run = compiled(_cover_loop) or cover_numpy
+    left, top, right, bottom = run(edges)
+    left, top, right, bottom = max(left - 1, 0), max(top - 1, 0), min(right + 1, width), min(bottom + 1, height)
+    return left, top, max(left, right), max(top, bottom)
+
+
+def cover_numpy(edges):
+    """Twin of the compiled loop of :func:`cover`."""
+    if len(edges) == 0:
+        return 0, 0, -1, -1
+    return *edges[:, :2].min(axis=0).tolist(), *edges[:, 2:].max(axis=0).tolist()
+
+
+def _cover_loop(edges):
+    left = top = 2**62
+    right = bottom = -(2**62)
+    for m in range(len(edges)):
+        left, top = min(left, edges[m, 0]), min(top, edges[m, 1])
+        right, bottom = max(right, edges[m, 2]), max(bottom, edges[m, 3])
+    return left, top, right, bottom
+
+
+def _check_bins(bins, outside) -> None:
     if bins.ndim != 2 or bins.dtype != np.uint8:
         raise ValueError(f"bins must be a (H, W) uint8 image from hsv_bins, got {bins.shape} {bins.dtype}")
-    roots = np.sqrt(np.atleast_2d(targets).astype(float))
-    edges = np.asarray(edges, dtype=np.int64)
-    areas = np.asarray(areas, dtype=float)
-    if edges.ndim != 2 or edges.shape[1:] != (4,) or areas.shape != (len(edges),) or roots.shape[1] != 256:
-        raise ValueError(
-            f"need edges (M, 4), areas (M,) and targets (B, 256), got {edges.shape}, {areas.shape} and {roots.shape}"
-        )
+    if outside not in ("mismatch", "ignore"):
+        raise ValueError(f'outside must be "mismatch" or "ignore", got {outside!r}')
+
+
+def _check_edges(edges) -> np.ndarray:
+    edges = np.ascontiguousarray(edges, dtype=np.int64)
+    if edges.ndim != 2 or edges.shape[1] != 4:
+        raise ValueError(f"edges must have shape (M, 4), got {edges.shape}")
+    return edges
+
+
+def similarities_numpy(bins, edges, histograms, whole) -> np.ndarray:
+    """Twin of the compiled loops of :func:`similarities`: one ``cv2.calcHist`` a rectangle."""
     height, width = bins.shape
     visible = np.clip(edges, 0, [width, height, width, height])
-    visible[:, 2:] = np.maximum(visible[:, 2:], visible[:, :2])
-    direct, sweep = compiled(_direct_loop), compiled(_sweep_loop)
-    if direct is None or len(visible) == 0:
-        return np.minimum(similarities_numpy(bins, visible, np.maximum(areas, 1.0), roots), 1.0)
-    used = np.flatnonzero(roots.any(axis=0))  # only the bins that a target has need to be counted
-    numbers = np.full(256, len(used) % 256, dtype=np.uint8)
-    numbers[used] = np.arange(len(used))
-    left, top = visible[:, :2].min(axis=0)
-    right, bottom = visible[:, 2:].max(axis=0)
-    part = cv2.LUT(bins[top:bottom, left:right], numbers) if right > left and bottom > top else bins[:0, :0]
-    visible -= [left, top, left, top]
-    run = sweep if _sweep_pays(part, visible, len(used)) else direct
-    return np.minimum(run(part, visible, np.maximum(areas, 1.0), roots[:, used].copy()), 1.0)
+    counted = edges if whole else visible
+    areas = np.prod(counted[:, 2:] - counted[:, :2], axis=1)
+    rho = np.zeros(len(edges))
+    for m, (left, top, right, bottom) in enumerate(visible.tolist()):
+        if right > left and bottom > top:
+            counts = cv2.calcHist([bins[top:bottom, left:right]], [0], None, [256], [0, 256])[:, 0]
+            roots = np.sqrt(histograms[m % len(histograms)])
+            total = np.sqrt(counts, dtype=np.float32).astype(float) @ roots
+            if total**2 > ALIKE * (right - left) * (bottom - top):
+                total = np.sqrt(counts.astype(float)) @ roots
+            rho[m] = total / math.sqrt(areas[m])
+    return np.minimum(rho, 1.0)
 
 
-def _sweep_pays(part: np.ndarray, visible: np.ndarray, n_bins: int) -> bool:
-    """Say whether the sweep is the faster loop, from the measured cost of their inner steps, in nanoseconds."""
-    n_rows = len(np.unique(visible[:, 1::2]))
-    direct = 0.6 * np.prod(visible[:, 2:] - visible[:, :2], axis=1).sum() + 1.5 * n_bins * len(visible)
-    sweep = 1.0 * part.size + 0.1 * n_rows * part.shape[1] * n_bins + 2.0 * n_bins * len(visible)
+def _similarities_loop(bins, edges, origin, used, numbers, roots, whole):
+    height, width = bins.shape
+    regions, region_of, areas, cover, n_pixels, largest = _survey_loop(edges, height, width, origin, len(roots), whole)
+    left, top, right, bottom = cover
+    if not _sweep_pays(n_pixels, len(regions), right - left, bottom - top, roots.shape[1]):
+        totals = _direct_loop(bins, regions, used, roots)
+    elif largest < 2**16:
+        totals = _sweep_loop(bins, regions, cover, numbers, roots, np.zeros(0, dtype=np.uint16))
+    else:
+        totals = _sweep_loop(bins, regions, cover, numbers, roots, np.zeros(0, dtype=np.uint32))
+    rho = np.zeros(len(edges))
+    for m in range(len(edges)):
+        if region_of[m] >= 0:
+            rho[m] = min(totals[region_of[m]] / math.sqrt(areas[m]), 1.0)
+    return rho
+
+
+def _sweep_pays(n_pixels, n_regions, width, height, n_bins):
+    """Say whether the sweep is the faster loop, from the measured cost of the inner steps of both, in nanoseconds."""
+    direct = 0.6 * n_pixels + (120 + 2.0 * n_bins) * n_regions
+    sums = min(2 * n_regions, height) * min(2 * n_regions, width)
+    sweep = 1000 + 0.9 * width * height + 0.03 * n_bins * sums + (30 + 0.8 * n_bins) * n_regions
     return sweep < direct
 
 
-def similarities_numpy(bins, visible, areas, roots) -> np.ndarray:
-    """Twin of the compiled loops of :func:`similarities`: one ``cv2.calcHist`` a rectangle."""
-    rho = np.zeros(len(visible))
-    for m, (left, top, right, bottom) in enumerate(visible.tolist()):
-        if right > left and bottom > top:
-            counts = cv2.calcHist([bins[top:bottom, left:right]], [0], None, [256], [0, 256])[:, 0].astype(float)
-            rho[m] = np.sqrt(counts / areas[m]) @ roots[m % len(roots)]
-    return rho
+def _survey_loop(edges, height, width, origin, n_targets, whole):
+    """Cut rectangles to the image, and put equal ones together: a hash table finds who came before."""
+    n_rectangles, (x0, y0) = len(edges), origin
+    n_slots = 4
+    while n_slots < 2 * n_rectangles:
+        n_slots *= 2
+    slots = np.full(n_slots, -1, dtype=np.int32)
+    regions = np.empty((n_rectangles, 5), dtype=np.int32)  # left, top, right, bottom, target
+    region_of = np.full(n_rectangles, -1, dtype=np.int32)
+    areas = np.empty(n_rectangles)
+    cover_left, cover_top, cover_right, cover_bottom = width, height, 0, 0
+    n_regions = n_pixels = largest = 0
+    for m in range(n_rectangles):
+        left, top = min(max(int(edges[m, 0]) - x0, 0), width), min(max(int(edges[m, 1]) - y0, 0), height)
+        right, bottom = min(max(int(edges[m, 2]) - x0, 0), width), min(max(int(edges[m, 3]) - y0, 0), height)
+        n_visible = (right - left) * (bottom - top)
+        areas[m] = float(edges[m, 2] - edges[m, 0]) * float(edges[m, 3] - edges[m, 1]) if whole else n_visible
+        if right <= left or bottom <= top:
+            continue
+        target = m % n_targets
+        slot = ((((left * 65599 + top) * 65599 + right) * 65599 + bottom) * 0x9E3779B97F4A7C1 >> 20) + target
+        while True:
+            slot &= n_slots - 1
+            r = slots[slot]
+            if r < 0:  # a new one
+                slots[slot] = r = n_regions
+                regions[r, 0], regions[r, 1], regions[r, 2], regions[r, 3] = left, top, right, bottom
+                regions[r, 4] = target
+                n_regions += 1
+                n_pixels += n_visible
+                largest = max(largest, n_visible)
+                cover_left, cover_top = min(cover_left, left), min(cover_top, top)
+                cover_right, cover_bottom = max(cover_right, right), max(cover_bottom, bottom)
+            same = regions[r, 0] == left and regions[r, 1] == top and regions[r, 2] == right and regions[r, 3] == bottom
+            if same and regions[r, 4] == target:
+                region_of[m] = r
+                break
+            slot += 1
+    cover = cover_left, cover_top, max(cover_left, cover_right), max(cover_top, cover_bottom)
+    return regions[:n_regions], region_of, areas, cover, n_pixels, largest
 
 
-def _direct_loop(part, visible, areas, roots):
-    """Count the pixels of each rectangle by themselves; `part` holds numbers of used bins, or larger ones."""
-    n_targets, n_bins = roots.shape
-    rho = np.empty(len(visible))
-    counts = np.empty(256, dtype=np.int32)
-    for m in range(len(visible)):
-        left, top, right, bottom = visible[m]
+def _match_loop(counts, roots, n_visible):
+    """Sum the products of roots, in single precision unless the region is so like the target that it would show."""
+    total = 0.0
+    for k in range(len(counts)):
+        total += np.sqrt(np.float32(counts[k])) * roots[k]
+    if total * total > ALIKE * n_visible:
+        total = 0.0
+        for k in range(len(counts)):
+            total += math.sqrt(counts[k]) * roots[k]
+    return total
+
+
+def _direct_loop(bins, regions, used, roots):
+    """Count the pixels of each region by themselves.
+
+    Neighbours often have the same bin, and a counter cannot be raised twice at once: four take turns.
+    """
+    totals = np.empty(len(regions))
+    counts, own = np.empty((4, 256), dtype=np.int32), np.zeros(roots.shape[1], dtype=np.int32)
+    for r in range(len(regions)):
+        left, top, right, bottom, target = regions[r]
         counts[:] = 0
         for y in range(top, bottom):
-            for x in range(left, right):
-                counts[part[y, x]] += 1
-        total = 0.0
-        for k in range(n_bins):
-            total += math.sqrt(counts[k]) * roots[m % n_targets, k]
-        rho[m] = total / math.sqrt(areas[m])
-    return rho
+            x = left
+            while x + 4 <= right:
+                counts[0, bins[y, x]] += 1
+                counts[1, bins[y, x + 1]] += 1
+                counts[2, bins[y, x + 2]] += 1
+                counts[3, bins[y, x + 3]] += 1
+                x += 4
+            while x < right:
+                counts[0, bins[y, x]] += 1
+                x += 1
+        for k in range(len(used)):
+            own[k] = counts[0, used[k]] + counts[1, used[k]] + counts[2, used[k]] + counts[3, used[k]]
+        totals[r] = _match_loop(own, roots[target], (right - left) * (bottom - top))
+    return totals
 
 
-def _sweep_loop(part, visible, areas, roots):
-    """Go through the rows once, with a running count of every bin in every column.
+def _sweep_loop(bins, regions, cover, numbers, roots, counter):
+    """Go down the rows once, with a running count of every bin in every strip of columns.
 
-    The sum over the columns of a rectangle, where it ends less where it begins, is its histogram: the cost of a
-    rectangle does not depend on its size.
+    Strips lie between neighbouring edges of the regions. The running counts of a region's strips, at its bottom less
+    at its top, are its histogram: what a region costs does not depend on its size. Counters may overflow, for the
+    difference is right as long as the region itself has fewer pixels than they can count.
     """
-    height, width = part.shape
-    n_targets, n_bins = roots.shape
-    n_rectangles = len(visible)
-    begins, ends = np.argsort(visible[:, 1]), np.argsort(visible[:, 3])
-    columns = np.zeros((width, n_bins), dtype=np.int32)  # pixels of each bin above the current row
-    prefix = np.zeros((width + 1, n_bins), dtype=np.int32)  # the same, in all columns to the left
-    before = np.empty((n_rectangles, n_bins), dtype=np.int32)
-    rho = np.empty(n_rectangles)
-    b = e = 0
+    cover_left, cover_top, cover_right, cover_bottom = cover
+    width, height = cover_right - cover_left, cover_bottom - cover_top
+    n_regions, n_bins = len(regions), roots.shape[1]
+    strip = np.zeros(width + 1, dtype=np.int64)
+    first_above, first_below = np.full(height + 1, -1), np.full(height + 1, -1)  # chains of regions that begin, and
+    next_above, next_below = np.empty(n_regions, np.int64), np.empty(n_regions, np.int64)  # end, at each row
+    for r in range(n_regions):
+        left, top, right, bottom, _ = regions[r]
+        next_above[r], first_above[top - cover_top] = first_above[top - cover_top], r
+        next_below[r], first_below[bottom - cover_top] = first_below[bottom - cover_top], r
+        strip[left - cover_left] = strip[right - cover_left] = 1
+    for x in range(1, width + 1):
+        strip[x] += strip[x - 1]
+    n_strips = strip[width]  # numbered from 1
+    strips = np.zeros((n_strips + 1, n_bins), dtype=counter.dtype)  # pixels of each bin above the current row
+    sums = np.zeros((n_strips + 1, n_bins), dtype=counter.dtype)  # the same, in all strips to the left
+    before = np.empty((n_regions, n_bins), dtype=counter.dtype)
+    counts = np.empty(n_bins, dtype=counter.dtype)
+    totals = np.empty(n_regions)
     for y in range(height + 1):
-        begin = b < n_rectangles and visible[begins[b], 1] == y
-        if begin or (e < n_rectangles and visible[ends[e], 3] == y):
-            for x in range(width):
+        if first_above[y] >= 0 or first_below[y] >= 0:
+            for s in range(1, n_strips):
                 for k in range(n_bins):
-                    prefix[x + 1, k] = prefix[x, k] + columns[x, k]
-        while b < n_rectangles and visible[begins[b], 1] == y:
-            m = begins[b]
+                    sums[s + 1, k] = sums[s, k] + strips[s, k]
+        r = first_above[y]
+        while r >= 0:
+            left, right = strip[regions[r, 0] - cover_left], strip[regions[r, 2] - cover_left]
             for k in range(n_bins):
-                before[m, k] = prefix[visible[m, 2], k] - prefix[visible[m, 0], k]
-            b += 1
-        while e < n_rectangles and visible[ends[e], 3] == y:
-            m = ends[e]
-            total = 0.0
+                before[r, k] = sums[right, k] - sums[left, k]
+            r = next_above[r]
+        r = first_below[y]
+        while r >= 0:
+            left, right = strip[regions[r, 0] - cover_left], strip[regions[r, 2] - cover_left]
             for k in range(n_bins):
-                root = roots[m % n_targets, k]
-                if root > 0:
-                    count = prefix[visible[m, 2], k] - prefix[visible[m, 0], k] - before[m, k]
-                    total += math.sqrt(count) * root
-            rho[m] = total / math.sqrt(areas[m])
-            e += 1
+                counts[k] = sums[right, k] - sums[left, k] - before[r, k]
+            n_visible = (regions[r, 2] - regions[r, 0]) * (regions[r, 3] - regions[r, 1])
+            totals[r] = _match_loop(counts, roots[regions[r, 4]], n_visible)
+            r = next_below[r]
         if y < height:
             for x in range(width):
-                k = part[y, x]
-                if k < n_bins:
-                    columns[x, k] += 1
-    return rho
+                strips[strip[x], numbers[bins[cover_top + y, cover_left + x]]] += 1
+    return totals
+
+
+def observe(bins, origin, particles, edges, log_weights, colors: Palette, sigma: float, size, outside: str):
+    """All that a colour particle filter learns from a frame (Owczarek et al. 2015, eqs 11 to 14, 5 and 7), at once.
+
+    Parameters
+    ----------
+    bins : ndarray, shape (H, W), uint8
+        Bin image of the part of the frame that shows the particles.
+    origin : tuple of int
+        Position ``(x, y)`` of its first pixel.
+    particles, edges : ndarray, shapes (N, 5) and (N, 4)
+        From :func:`move`.
+    log_weights : ndarray, shape (N,)
+        What was known before.
+    colors : Palette
+        The target's.
+    sigma : float
+        Standard deviation of the Hellinger distance, above 0.
+    size : array_like, shape (2,)
+        Width and height of the target in pixels at scale 1.
+    outside : {"mismatch", "ignore"}
+        As for :func:`similarities`.
+
+    Returns
+    -------
+    log_weights : ndarray, shape (N,)
+        The old ones plus the logarithms of the likelihoods, without the constant of eq. 13.
+    weights : ndarray, shape (N,)
+        Normalised weights.
+    n_effective : float
+        Effective sample size.
+    mean : ndarray, shape (5,)
+        Weighted mean of the particles.
+    box : ndarray, shape (4,)
+        Its rectangle ``(x, y, w, h)`` in pixels.
+    similarity : float
+        Bhattacharyya coefficient of that rectangle's colours with the target's.
+
+    Raises
+    ------
+    ValueError
+        If an array has the wrong shape or dtype.
+
+    Examples
+    --------
+    >>> bins = np.zeros((20, 20), dtype=np.uint8)
+    >>> bins[:, 10:] = 7
+    >>> particles = np.array([[5.0, 10.0, 0.0, 0.0, 1.0], [15.0, 10.0, 0.0, 0.0, 1.0]])
+    >>> edges = [[1, 6, 9, 14], [11, 6, 19, 14]]
+    >>> colors = palette(np.eye(256)[7])
+    >>> _, weights, *_, box, similarity = observe(bins, (0, 0), particles, edges, [0, 0], colors, 0.1, (8, 8), "ignore")
+    >>> print(weights.round(3), box.round(3), round(similarity, 3))
+    [0. 1.] [11.  6.  8.  8.] 1.0
+    """
+    _check_bins(bins, outside)
+    edges = _check_edges(edges)
+    particles = np.ascontiguousarray(particles, dtype=float)
+    log_weights = np.ascontiguousarray(log_weights, dtype=float)
+    if particles.shape != (len(edges), 5) or log_weights.shape != (len(edges),) or len(edges) == 0:
+        raise ValueError(
+            f"need particles (N, 5), edges (N, 4) and log-weights (N,), "
+            f"got shapes {particles.shape}, {edges.shape} and {log_weights.shape}"
+        )
+    settings = float(sigma), float(size[0]), float(size[1]), outside == "mismatch"
+    run = compiled(_observe_loop, reorder=True)
+    if run is None:
+        return observe_numpy(bins, origin, particles, edges, log_weights, colors, *settings)
+    bins = np.ascontiguousarray(bins)
+    return run(bins, origin, particles, edges, log_weights, colors.used, colors.numbers, colors.roots, *settings)
+
+
+def observe_numpy(bins, origin, particles, edges, log_weights, colors, sigma, width, height, whole):
+    """Twin of the compiled loop of :func:`observe`, and the plainest account of it."""
+    origin = np.array([*origin, *origin])
+    similarity = similarities_numpy(bins, edges - origin, colors.histograms, whole)  # eq. 12
+    log_weights = log_weights - (1.0 - similarity) / (2 * sigma**2)  # eqs 11 and 13
+    weights, mean, n_effective, _ = weigh_numpy(log_weights, particles)  # eqs 5, 14 and 7
+    w, h = mean[4] * width, mean[4] * height
+    left, top = mean[0] - w / 2, mean[1] - h / 2
+    edges_at_mean = np.floor(np.array([[left, top, left + w, top + h]]) + 0.5).astype(np.int64)
+    (at_mean,) = similarities_numpy(bins, edges_at_mean - origin, colors.histograms, whole)
+    return log_weights, weights, n_effective, mean, np.array([left, top, w, h]), at_mean
+
+
+def _observe_loop(bins, origin, particles, edges, log_weights, used, numbers, roots, sigma, width, height, whole):
+    rho = _similarities_loop(bins, edges, origin, used, numbers, roots, whole)
+    log_weights = log_weights - (1.0 - rho) / (2 * sigma**2)
+    weights, mean, n_effective, _ = _weigh_loop(log_weights, particles)
+    w, h = mean[4] * width, mean[4] * height
+    left, top = mean[0] - w / 2, mean[1] - h / 2
+    edges_at_mean = np.empty((1, 4), dtype=np.int64)
+    edges_at_mean[0, 0], edges_at_mean[0, 1] = math.floor(left + 0.5), math.floor(top + 0.5)
+    edges_at_mean[0, 2], edges_at_mean[0, 3] = math.floor(left + w + 0.5), math.floor(top + h + 0.5)
+    at_mean = _similarities_loop(bins, edges_at_mean, origin, used, numbers, roots, whole)[0]
+    return log_weights, weights, n_effective, mean, np.array([left, top, w, h]), at_mean
 
 
 # ---------------------------------------------------------------------------------------------------------------------

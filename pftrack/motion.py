@@ -149,9 +149,9 @@ def reinitialize(
     width, height = image_size
     if n_particles < 1 or width < 1 or height < 1:
         raise ValueError(f"need at least one particle and an image with area, got {n_particles} and {image_size}")
-    low = [0, 0, velocity_range[0], velocity_range[0], scale_range[0]]
-    high = [width, height, velocity_range[1], velocity_range[1], scale_range[1]]
-    return rng.uniform(low, high, size=(n_particles, 5))
+    low = np.array([0, 0, velocity_range[0], velocity_range[0], scale_range[0]])
+    high = np.array([width, height, velocity_range[1], velocity_range[1], scale_range[1]])
+    return low + (high - low) * rng.random((n_particles, 5))
 
 
 def reduced_gray(frame: np.ndarray, width: int = 160) -> np.ndarray:

@@ -21,12 +21,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pftrack import kernels
 
-def _check_weights(weights) -> np.ndarray:
+
+def _one_dimensional(weights) -> np.ndarray:
     weights = np.asarray(weights, dtype=float)
     if weights.ndim != 1 or weights.size == 0:
         raise ValueError(f"weights must be a non-empty one-dimensional array, got shape {weights.shape}")
-    if not np.all(weights >= 0):  # also catches NaN
+    return weights
+
+
+def _check_weights(weights) -> np.ndarray:
+    weights = _one_dimensional(weights)
+    if not weights.min() >= 0:  # also catches NaN
         raise ValueError("weights must not be negative or NaN")
     total = weights.sum()
     if abs(total - 1.0) > 1e-6:
@@ -38,7 +45,7 @@ def _check_log_weights(log_weights) -> np.ndarray:
     log_weights = np.asarray(log_weights, dtype=float)
     if log_weights.ndim != 1 or log_weights.size == 0:
         raise ValueError(f"log_weights must be a non-empty one-dimensional array, got shape {log_weights.shape}")
-    if np.isnan(log_weights).any() or np.isposinf(log_weights).any():
+    if not log_weights.max() < np.inf:  # also catches NaN
         raise ValueError("log_weights must not hold NaN or +inf; a weight of zero is -inf")
     return log_weights
 
@@ -146,7 +153,7 @@ def effective_sample_size(weights) -> float:
     1.0
     """
     weights = _check_weights(weights)
-    return float(1.0 / np.sum(weights**2))
+    return float(1.0 / (weights @ weights))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -159,6 +166,14 @@ def _invert(weights: np.ndarray, uniforms: np.ndarray) -> np.ndarray:
     """Indices at which the cumulative weights pass each of the `uniforms` in [0, 1)."""
     indices = np.searchsorted(np.cumsum(weights), uniforms, side="right")
     return np.minimum(indices, np.flatnonzero(weights)[-1])  # rounding must never pick a particle of weight zero
+
+
+def _comb(weights: np.ndarray, shifts: np.ndarray, n_draws: int) -> np.ndarray:
+    """Indices at which the cumulative weights pass the teeth of a comb; the weights are checked on the way."""
+    ancestors, smallest, total = kernels.comb(weights, shifts, n_draws)
+    if not (smallest >= 0 and abs(total - 1.0) <= 1e-6):
+        _check_weights(weights)  # says what is wrong
+    return ancestors
 
 
 def _check_n_draws(n_draws, weights) -> int:
@@ -213,9 +228,9 @@ def stratified(weights, rng: np.random.Generator, n_draws: int | None = None) ->
     >>> stratified([0.5, 0.5], np.random.default_rng(0), n_draws=4)
     array([0, 0, 1, 1])
     """
-    weights = _check_weights(weights)
+    weights = _one_dimensional(weights)
     n_draws = _check_n_draws(n_draws, weights)
-    return _invert(weights, (rng.random(n_draws) + np.arange(n_draws)) / n_draws)
+    return _comb(weights, rng.random(n_draws), n_draws)
 
 
 def systematic(weights, rng: np.random.Generator, n_draws: int | None = None) -> np.ndarray:
@@ -230,9 +245,9 @@ def systematic(weights, rng: np.random.Generator, n_draws: int | None = None) ->
     >>> systematic([0.25, 0.5, 0.25], np.random.default_rng(0), n_draws=4)
     array([0, 1, 1, 2])
     """
-    weights = _check_weights(weights)
+    weights = _one_dimensional(weights)
     n_draws = _check_n_draws(n_draws, weights)
-    return _invert(weights, (rng.random() + np.arange(n_draws)) / n_draws)
+    return _comb(weights, rng.random(1), n_draws)
 
 
 def residual(weights, rng: np.random.Generator, n_draws: int | None = None) -> np.ndarray:
@@ -464,10 +479,9 @@ def bootstrap_filter(
                 f"at step {t} log_likelihood returned shape {log_likelihoods.shape}, expected ({n_particles},)"
             )
         log_weights = log_weights + log_likelihoods  # update
-        increment = log_sum_exp(log_weights)
-        weights = normalize(log_weights)
-        mean, covariance = weighted_mean(states, weights), weighted_covariance(states, weights)  # estimate
-        n_effective = effective_sample_size(weights)
+        weights, mean, n_effective, increment = kernels.weigh(log_weights, states)  # and estimate
+        centered = states - mean
+        covariance = (weights[:, None] * centered).T @ centered
         resample = n_effective < resample_threshold * n_particles
         steps.append((mean, covariance, n_effective, increment, resample))
         updated = states, weights

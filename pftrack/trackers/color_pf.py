@@ -8,9 +8,11 @@ with a default, chosen once. Chapter 5 builds the filter step by step; chapter 6
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from pftrack import color, motion, smc
+from pftrack import color, kernels, motion, smc
 from pftrack.trackers.base import Estimate, Prepared, check_box, check_frame, check_seed, check_started
 
 
@@ -35,8 +37,10 @@ def particle_boxes(particles, size) -> np.ndarray:
     array([[80., 20., 40., 60.]])
     """
     particles = np.asarray(particles, dtype=float)
-    sizes = particles[:, 4:5] * np.asarray(size, dtype=float)
-    return np.concatenate([particles[:, :2] - sizes / 2, sizes], axis=1)
+    boxes = np.empty((len(particles), 4))
+    boxes[:, 2:] = particles[:, 4:] * size
+    boxes[:, :2] = particles[:, :2] - boxes[:, 2:] / 2
+    return boxes
 
 
 def _picture(frame: np.ndarray | Prepared) -> np.ndarray:
@@ -189,6 +193,7 @@ class ColorParticleFilter:
         box = check_box(box, frame)
         self.rng = np.random.default_rng(self.seed)
         self.target = color.histograms(_picture(frame), [box], outside="ignore")[0]
+        self.palette = kernels.palette(self.target)
         self.size = box[2:]
         self.noise_in_pixels = self.noise * [box[2], box[2], box[2], box[2], 1.0]
         self.particles = np.tile([*(box[:2] + box[2:] / 2), 0.0, 0.0, 1.0], (self.n_particles, 1))
@@ -216,35 +221,25 @@ class ColorParticleFilter:
             If the frame is unusable, or `init` was not called.
         """
         frame = check_frame(frame, check_started(self._shape))
-        particles = self._predict()
-        log_weights = self.log_weights + self._log_likelihood(frame, particles)  # eqs 12 and 13
-        weights = smc.normalize(log_weights)  # eq. 5
-        mean = smc.weighted_mean(particles, weights)  # eq. 14
-        box = particle_boxes([mean], self.size)[0]
-        distance = color.distances(_picture(frame), [box], self.target, self.outside)[0]
+        particles, edges = kernels.move(
+            self.particles, self.noise_in_pixels, self.rng, self.dt, self.scale_limits, self.size
+        )  # eqs 8 to 10
+        bins, origin = color.covered_bins(_picture(frame), edges)
+        log_weights, weights, n_effective, mean, box, similarity = kernels.observe(
+            bins, origin, particles, edges, self.log_weights, self.palette, self.sigma, self.size, self.outside
+        )  # eqs 11 to 14, 5 and 7
+        distance = math.sqrt(1.0 - similarity)
         lost = self._is_off_image(mean) or distance > self.lost_distance
         estimate = Estimate(box, float(1.0 - distance), bool(lost), particles, weights)
         if lost:
             height, width = frame.shape[:2]
             particles = motion.reinitialize(self.n_particles, (width, height), self.rng, self.scale_range)
             log_weights = np.zeros(self.n_particles)
-        elif smc.effective_sample_size(weights) < self.resample_threshold * self.n_particles:
-            particles = particles[self.resampler(weights, self.rng)]
+        elif n_effective < self.resample_threshold * self.n_particles:
+            particles = particles.take(self.resampler(weights, self.rng), axis=0)
             log_weights = np.zeros(self.n_particles)
         self.particles, self.log_weights = particles, log_weights
         return estimate
-
-    def _predict(self) -> np.ndarray:
-        """Move the particles (eqs 9 and 10) and keep their scales within the limits."""
-        matrix = motion.constant_velocity(self.dt)
-        particles = motion.linear_gaussian(self.particles, matrix, self.noise_in_pixels, self.rng)
-        particles[:, 4] = np.clip(particles[:, 4], *self.scale_limits)
-        return particles
-
-    def _log_likelihood(self, frame: np.ndarray, particles: np.ndarray) -> np.ndarray:
-        """Return how well each particle's rectangle shows the target's colours (eqs 11 and 13)."""
-        boxes = particle_boxes(particles, self.size)
-        return color.log_likelihood(_picture(frame), boxes, self.target, self.sigma, self.outside)
 
     def _is_off_image(self, mean: np.ndarray) -> bool:
         height, width = self._shape[:2]

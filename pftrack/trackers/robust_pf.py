@@ -331,8 +331,7 @@ class RobustParticleFilter:
     def _cues(self, look: Description, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Root mean square Hellinger distance of the bands, and the template's prediction, of each box."""
         edges = self._bands(boxes)
-        areas = np.prod(edges[:, 2:] - edges[:, :2], axis=1)
-        similarity = kernels.similarities(look.bins, edges, areas, self.targets).reshape(len(boxes), -1)
+        similarity = kernels.similarities(look.bins, edges, self.targets).reshape(len(boxes), -1)
         distances = np.sqrt(1 - similarity.mean(axis=1))
         if self.template is None:
             return distances, np.zeros(len(boxes))
