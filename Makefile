@@ -1,11 +1,11 @@
-# book, test, notebooks, lab and clean; each of the first four makes its own .venv first.
+# book, test, notebooks, lab, bench and clean; each but the last makes its own environment first.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # the tests share the cores by processes; threads on top of them only wait
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: book test notebooks lab clean
+.PHONY: book test notebooks lab bench clean
 
 book: $(VENV)/ready
 	rm -rf _build/html
@@ -25,12 +25,20 @@ notebooks: $(VENV)/ready
 lab: $(VENV)/ready
 	$(BIN)/jupyter lab notebooks
 
+bench: benchmarks/.venv/ready
+	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/speed.py $(ARGS)
+
 clean:
-	rm -rf _build $(VENV) *.egg-info .pytest_cache .ruff_cache .coverage
+	rm -rf _build $(VENV) benchmarks/.venv *.egg-info .pytest_cache .ruff_cache .coverage
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/ready: requirements.txt pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "pftrack needs Python 3.11 or newer: make PYTHON=python3.12 ..."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.txt
+	@touch $@
+
+benchmarks/.venv/ready: benchmarks/requirements.txt
+	$(PYTHON) -m venv benchmarks/.venv
+	benchmarks/.venv/bin/pip install --quiet --disable-pip-version-check -r $<
 	@touch $@

@@ -227,7 +227,8 @@ class RobustParticleFilter:
         box = check_box(box, look)
         self.rng = np.random.default_rng(self.seed)
         self.size, self._shape, self._n_updates, self._n_bad = box[2:], look.shape, 0, 0
-        self.targets = self._first_targets = self._running_targets = self._histograms(look, box)
+        self._first_targets = self._running_targets = self._histograms(look, box)
+        self.palette = kernels.palette(self._first_targets)
         self.template = template.RidgeTemplate(self.rng) if self.template_weight else None
         if self.template:
             self._learn_template(look, box)
@@ -261,14 +262,14 @@ class RobustParticleFilter:
         particles, log_weights = self._predict(look)
         distances, fits = self._cues(look, self._boxes(particles))
         log_weights = log_weights - distances**2 / (2 * self.sigma**2) + self.template_weight * fits
-        weights = smc.normalize(log_weights)
-        self._mean = smc.weighted_mean(particles, weights)
+        weights, self._mean, n_effective, _ = kernels.weigh(log_weights, particles)
         box = self._boxes(self._mean[None])[0]
         (distance,), (fit,) = self._cues(look, box[None])
         self._judge_and_learn(look, box, distance, fit)
         estimate = Estimate(box, float(1 - distance), self._is_lost, particles, weights)
-        if smc.effective_sample_size(weights) < self.resample_threshold * self.n_particles:
-            particles, log_weights = particles[smc.systematic(weights, self.rng)], np.zeros(self.n_particles)
+        if n_effective < self.resample_threshold * self.n_particles:
+            particles = particles.take(smc.systematic(weights, self.rng), axis=0)
+            log_weights = np.zeros(self.n_particles)
         self.particles, self.log_weights = particles, log_weights
         return estimate
 
@@ -331,7 +332,7 @@ class RobustParticleFilter:
     def _cues(self, look: Description, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Root mean square Hellinger distance of the bands, and the template's prediction, of each box."""
         edges = self._bands(boxes)
-        similarity = kernels.similarities(look.bins, edges, self.targets).reshape(len(boxes), -1)
+        similarity = kernels.similarities(look.bins, edges, self.palette).reshape(len(boxes), -1)
         distances = np.sqrt(1 - similarity.mean(axis=1))
         if self.template is None:
             return distances, np.zeros(len(boxes))
@@ -361,7 +362,7 @@ class RobustParticleFilter:
         if good and self.learning_rate:
             step = self.learning_rate * (self._histograms(look, box) - self._running_targets)
             self._running_targets = self._running_targets + step
-            self.targets = KEPT * self._first_targets + (1 - KEPT) * self._running_targets
+            self.palette = kernels.palette(KEPT * self._first_targets + (1 - KEPT) * self._running_targets)
 
     def _learn_template(self, look: Description, box: np.ndarray) -> None:
         integral, side = look.channels(self.size[0])
