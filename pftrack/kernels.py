@@ -677,7 +677,8 @@ def _match_loop(counts, roots, n_visible):
 def _direct_loop(bins, regions, used, roots):
     """Count the pixels of each region by themselves.
 
-    Neighbours often have the same bin, and a counter cannot be raised twice at once: four take turns.
+    Neighbours often have the same bin, and a counter that has just been raised may have to be waited for: four take
+    turns.
     """
     totals = np.empty(len(regions))
     counts, own = np.empty((4, 256), dtype=np.int32), np.zeros(roots.shape[1], dtype=np.int32)
@@ -712,40 +713,46 @@ def _sweep_loop(bins, regions, cover, numbers, roots, counter):
     width, height = cover_right - cover_left, cover_bottom - cover_top
     n_regions, n_bins = len(regions), roots.shape[1]
     strip = np.zeros(width + 1, dtype=np.int64)
-    first_above, first_below = np.full(height + 1, -1), np.full(height + 1, -1)  # chains of regions that begin, and
-    next_above, next_below = np.empty(n_regions, np.int64), np.empty(n_regions, np.int64)  # end, at each row
+    beginning, ending = np.full(height + 1, -1), np.full(height + 1, -1)  # the last region to begin or end at each row,
+    begins_before, ends_before = np.empty(n_regions, np.int64), np.empty(n_regions, np.int64)  # and the one before it
+    leftmost, rightmost = np.full(height + 1, width), np.zeros(height + 1, np.int64)  # among those
     for r in range(n_regions):
-        left, top, right, bottom, _ = regions[r]
-        next_above[r], first_above[top - cover_top] = first_above[top - cover_top], r
-        next_below[r], first_below[bottom - cover_top] = first_below[bottom - cover_top], r
-        strip[left - cover_left] = strip[right - cover_left] = 1
+        left, right = regions[r, 0] - cover_left, regions[r, 2] - cover_left
+        top, bottom = regions[r, 1] - cover_top, regions[r, 3] - cover_top
+        begins_before[r], beginning[top] = beginning[top], r
+        ends_before[r], ending[bottom] = ending[bottom], r
+        strip[left] = strip[right] = 1
+        for y in (top, bottom):
+            leftmost[y], rightmost[y] = min(leftmost[y], left), max(rightmost[y], right)
     for x in range(1, width + 1):
         strip[x] += strip[x - 1]
     n_strips = strip[width]  # numbered from 1
     strips = np.zeros((n_strips + 1, n_bins), dtype=counter.dtype)  # pixels of each bin above the current row
-    sums = np.zeros((n_strips + 1, n_bins), dtype=counter.dtype)  # the same, in all strips to the left
+    sums = np.zeros((n_strips + 1, n_bins), dtype=counter.dtype)  # sums of these from some strip on
     before = np.empty((n_regions, n_bins), dtype=counter.dtype)
     counts = np.empty(n_bins, dtype=counter.dtype)
     totals = np.empty(n_regions)
     for y in range(height + 1):
-        if first_above[y] >= 0 or first_below[y] >= 0:
+        if leftmost[y] < rightmost[y]:
+            first, last = strip[leftmost[y]], strip[rightmost[y]]
             for s in range(1, n_strips):
-                for k in range(n_bins):
-                    sums[s + 1, k] = sums[s, k] + strips[s, k]
-        r = first_above[y]
+                if first <= s < last:  # no others are asked for in this row
+                    for k in range(n_bins):
+                        sums[s + 1, k] = sums[s, k] + strips[s, k]
+        r = beginning[y]
         while r >= 0:
             left, right = strip[regions[r, 0] - cover_left], strip[regions[r, 2] - cover_left]
             for k in range(n_bins):
                 before[r, k] = sums[right, k] - sums[left, k]
-            r = next_above[r]
-        r = first_below[y]
+            r = begins_before[r]
+        r = ending[y]
         while r >= 0:
             left, right = strip[regions[r, 0] - cover_left], strip[regions[r, 2] - cover_left]
             for k in range(n_bins):
                 counts[k] = sums[right, k] - sums[left, k] - before[r, k]
             n_visible = (regions[r, 2] - regions[r, 0]) * (regions[r, 3] - regions[r, 1])
             totals[r] = _match_loop(counts, roots[regions[r, 4]], n_visible)
-            r = next_below[r]
+            r = ends_before[r]
         if y < height:
             for x in range(width):
                 strips[strip[x], numbers[bins[cover_top + y, cover_left + x]]] += 1
