@@ -259,12 +259,17 @@ def fig3(plan: Plan) -> list[Path]:
     runs = experiments.grid("color-pf", plan.sequence, seeds=range(plan.n_runs), settings=variants)
     scores = experiments.table(runs, plan.run(runs))
     summary = _mean_and_sd(scores, ["n_particles"])
-    times = [experiments.time_per_frame(Run("color-pf", plan.sequence, 0, variant)) for variant in variants]
+    times = _times([Run("color-pf", plan.sequence, 0, variant) for variant in variants])
     summary["ms_min"], summary["ms_median"] = np.min(times, axis=1), np.median(times, axis=1)
     about = _settings(plan, plan.n_runs)
     del about["n_particles"]
     rows = scores[["n_particles", "seed", *scores.columns[scores.columns.get_loc("n_frames") :]]]
     return [plan.write("fig3-runs.csv", rows, **about), plan.write("fig3.csv", summary, **about)]
+
+
+def _times(runs: list[Run], n_passes: int = 10) -> np.ndarray:
+    """Measure milliseconds a frame, one row a run; runs take turns, so that slow spells of a machine hit all alike."""
+    return np.hstack([[experiments.time_per_frame(run, repeats=1) for run in runs] for _ in range(n_passes)])
 
 
 def _settings(plan: Plan, n_runs: int, tracker: str = "color-pf") -> dict[str, object]:
@@ -356,10 +361,11 @@ def table2(plan: Plan) -> list[Path]:
     overlaps = {tracker: search.overlaps for tracker, search in found.items()} | {"color-pf": pf, "floor": floor}
     hits = {name: _hits(rates) for name, rates in overlaps.items()}
     iterations = {tracker: search.iterations[:, 1:] for tracker, search in found.items()}
-    times = {
-        tracker: experiments.time_per_frame(Run(tracker, plan.sequence, seed))[:, None]
+    timed = [
+        Run(tracker, plan.sequence, seed)
         for tracker, seed in (("camshift", None), ("mean-shift", None), ("color-pf", 0))
-    }
+    ]
+    times = {run.tracker: passes[:, None] for run, passes in zip(timed, _times(timed), strict=True)}
     rows = []
     for measure, values in (("overlap", overlaps), ("hit_ratio", hits)):
         counted = {name: np.nan_to_num(rates) for name, rates in values.items()}

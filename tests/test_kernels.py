@@ -309,6 +309,23 @@ def test_what_is_observed_must_fit_together():
         kernels.weigh([], np.zeros((0, 2)))
 
 
+def test_a_loop_is_compiled_once_whoever_calls_it():
+    """Compiling takes seconds: lists, slices and other types must not bring a second signature into being."""
+    scene = pftrack.datasets.load("synthetic-walk")
+    for tracker in (
+        pftrack.ColorParticleFilter(100),
+        pftrack.ColorParticleFilter(1000),
+        pftrack.RobustParticleFilter(),
+    ):
+        pftrack.track(tracker, scene.frames[:4], scene.boxes[0].tolist())
+    color.distances(scene.frames[0][:, ::-1], [[3, 4, 20, 30]], color.histograms(scene.frames[0], [[9, 9, 9, 9]])[0])
+    smc.stratified([0.5, 0.5], np.random.default_rng(0))
+    unordered = kernels._observe_loop, kernels._similarities_loop, kernels._weigh_loop
+    ordered = kernels._bin_image_loop, kernels._comb_loop, kernels._cover_loop, kernels._draw_and_move_loop
+    dispatchers = [kernels.compiled(loop, reorder=True) for loop in unordered] + [kernels.compiled(f) for f in ordered]
+    assert [len(dispatcher.signatures) for dispatcher in dispatchers] == [1] * len(dispatchers)
+
+
 @pytest.mark.parametrize("name", ["bobot-I", "synthetic-occlusion"])
 @pytest.mark.parametrize("tracker", [pftrack.ColorParticleFilter, pftrack.RobustParticleFilter])
 def test_trackers_give_the_boxes_of_the_numpy_twins(monkeypatch, tracker, name):
