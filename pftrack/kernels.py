@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 ALIKE = 0.998
-"""Squared Bhattacharyya coefficient above which square roots are taken in double precision: the Hellinger distance is
+"""Squared Bhattacharyya coefficient above which square roots are taken in double precision. The Hellinger distance is
 then so small that the 8th decimal of the coefficient shows in its 6th."""
 
 MANY_DRAWS = 1500

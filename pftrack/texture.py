@@ -20,7 +20,7 @@ import numpy as np
 from pftrack import kernels
 
 N_PATTERNS = 59
-"""Number of labels: 58 uniform patterns, and one for all the others."""
+"""Number of labels, of 58 uniform patterns and of all the others together."""
 
 
 def _uniform_labels() -> np.ndarray:
