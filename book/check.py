@@ -34,7 +34,9 @@ class Fetches(HTMLParser):
 def problems(site: Path) -> list[str]:
     """List what is wrong with the site; empty if nothing is."""
     contents = yaml.safe_load(Path("_toc.yml").read_text(encoding="utf-8"))
-    names = [contents["root"], *(chapter["file"] for part in contents["parts"] for chapter in part["chapters"])]
+    chapters = [chapter for part in contents["parts"] for chapter in part["chapters"]]
+    pages = [page for chapter in chapters for page in (chapter, *chapter.get("sections", []))]
+    names = [contents["root"], *(page["file"] for page in pages)]
     found = [f"{name}.html is missing" for name in names if not (site / f"{name}.html").is_file()]
     for page in site.rglob("*.html"):
         parser = Fetches()

@@ -2,10 +2,10 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).parents[1]
 
@@ -23,8 +23,7 @@ def check(monkeypatch):
 @pytest.fixture
 def site(tmp_path):
     """Write an empty page for every entry of the contents."""
-    contents = yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))
-    names = [contents["root"], *(chapter["file"] for part in contents["parts"] for chapter in part["chapters"])]
+    names = re.findall(r"(?:file|root): (\S+)", (ROOT / "_toc.yml").read_text(encoding="utf-8"))
     for name in names:
         page = tmp_path / f"{name}.html"
         page.parent.mkdir(exist_ok=True)
