@@ -927,7 +927,7 @@ def _channel_integral_loop(dx, dy, relative, lab):
     return sums
 
 
-def cell_means(integral: np.ndarray, boxes, grid: tuple[int, int]) -> np.ndarray:
+def cell_means(integral: np.ndarray, boxes, grid: tuple[int, int], origin=(0, 0)) -> np.ndarray:
     """Mean of each channel over each cell of a grid laid on each of many boxes.
 
     Parameters
@@ -938,6 +938,8 @@ def cell_means(integral: np.ndarray, boxes, grid: tuple[int, int]) -> np.ndarray
         Boxes ``(x, y, w, h)`` in pixels of that image. What lies outside the image counts as zero.
     grid : tuple of int
         Number of rows and columns.
+    origin : tuple of int
+        Position ``(x, y)`` of the first pixel of the integral image, where that is of a part.
 
     Returns
     -------
@@ -962,8 +964,10 @@ def cell_means(integral: np.ndarray, boxes, grid: tuple[int, int]) -> np.ndarray
         raise ValueError(f"need boxes (N, 4) and an int32 integral image, got {boxes.shape} and {integral.shape}")
     x, y, w, h = boxes.T[..., None]
     rows, columns = grid
-    edges_x = np.floor(x + w * np.arange(columns + 1) / columns + 0.5).clip(0, integral.shape[1] - 1).astype(int)
-    edges_y = np.floor(y + h * np.arange(rows + 1) / rows + 0.5).clip(0, integral.shape[0] - 1).astype(int)
+    edges_x = np.floor(x + w * np.arange(columns + 1) / columns + 0.5) - origin[0]
+    edges_y = np.floor(y + h * np.arange(rows + 1) / rows + 0.5) - origin[1]
+    edges_x = edges_x.clip(0, integral.shape[1] - 1).astype(int)
+    edges_y = edges_y.clip(0, integral.shape[0] - 1).astype(int)
     run = compiled(_cell_sums_loop) or cell_sums_numpy
     sums = run(np.ascontiguousarray(integral), edges_x, edges_y)
     return sums / np.maximum(w * h / (rows * columns), 1.0)[..., None, None]

@@ -27,6 +27,9 @@ GRID = 8, 4
 MARGIN = 0.1, 0.04
 """Surroundings of the box that the grid takes in on each side, relative to its width and height."""
 
+REACH = 6
+"""How far beyond a box, in reduced pixels, the picture matters: for rounding, gradients and their mean nearby."""
+
 WIDTH = 24
 """Width of the target, in pixels, in the reduced image from which channels are taken."""
 
@@ -48,20 +51,73 @@ def reduced_channels(frame: np.ndarray, width: float) -> tuple[np.ndarray, int]:
     f : int
         Side, in pixels of the frame, of the squares that have become one pixel; at least 1.
     """
+    f = _reduction(frame, width)
+    return kernels.channel_integral(_reduced(frame, f)), f
+
+
+def _reduction(frame: np.ndarray, width: float) -> int:
     height, width_of_frame = frame.shape[:2]
-    f = min(max(round(width / WIDTH), 1), height // 8, width_of_frame // 8) or 1
-    whole = frame[: height // f * f, : width_of_frame // f * f]
-    size = width_of_frame // f, height // f
-    return kernels.channel_integral(cv2.resize(whole, size, interpolation=cv2.INTER_AREA) if f > 1 else frame), f
+    return min(max(round(width / WIDTH), 1), height // 8, width_of_frame // 8) or 1
 
 
-def features(integral: np.ndarray, boxes) -> np.ndarray:
+def _reduced(frame: np.ndarray, f: int) -> np.ndarray:
+    """Average squares of `f` by `f` pixels; what is left over at the right and at the bottom is cut off."""
+    height, width = frame.shape[0] // f, frame.shape[1] // f
+    whole = frame[: height * f, : width * f]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA) if f > 1 else whole
+
+
+class PartialChannels:
+    """Integral channels as of :func:`reduced_channels`, made only of the part of a frame that boxes cover.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W, 3), uint8
+        A colour image in BGR order.
+    width : float
+        Width of the target in the frame, in pixels.
+
+    Attributes
+    ----------
+    side : int
+        Side, in pixels of the frame, of the squares that have become one pixel.
+
+    Examples
+    --------
+    >>> frame = np.random.default_rng(0).integers(0, 256, (200, 300, 3), dtype=np.uint8)
+    >>> whole, side = reduced_channels(frame, width=24)
+    >>> part = PartialChannels(frame, width=24)
+    >>> box = [[100, 50, 24, 60]]
+    >>> part(box)[0].shape, bool((features(part, box) == features(whole, box)).all())
+    ((73, 37, 9), True)
+    """
+
+    def __init__(self, frame: np.ndarray, width: float):
+        self.frame, self.side = frame, _reduction(frame, width)
+        self._edges, self._integral = None, None
+
+    def __call__(self, boxes) -> tuple[np.ndarray, tuple[int, int]]:
+        """Return an integral image that covers boxes ``(x, y, w, h)`` in reduced pixels, and where it begins."""
+        boxes, f = np.asarray(boxes, dtype=float), self.side
+        height, width = self.frame.shape[0] // f, self.frame.shape[1] // f
+        low, high = boxes[:, :2].min(axis=0), (boxes[:, :2] + boxes[:, 2:]).max(axis=0)
+        left, top = np.clip(np.floor(low).astype(int) - REACH, 0, [width - 1, height - 1]).tolist()
+        right, bottom = np.clip(np.ceil(high).astype(int) + REACH, [left + 1, top + 1], [width, height]).tolist()
+        made = self._edges
+        if not made or left < made[0] or top < made[1] or right > made[2] or bottom > made[3]:
+            self._edges = left, top, right, bottom
+            part = self.frame[top * f : bottom * f, left * f : right * f]
+            self._integral = kernels.channel_integral(_reduced(part, f))
+        return self._integral, self._edges[:2]
+
+
+def features(channels, boxes) -> np.ndarray:
     """Features of many boxes: what each cell of the grid shows.
 
     Parameters
     ----------
-    integral : ndarray, shape (H + 1, W + 1, 9)
-        From :func:`pftrack.kernels.channel_integral`.
+    channels : ndarray, shape (H + 1, W + 1, 9), or PartialChannels
+        An integral image from :func:`pftrack.kernels.channel_integral`, or what makes one where the boxes are.
     boxes : array_like, shape (N, 4)
         Boxes ``(x, y, w, h)`` in pixels of that image.
 
@@ -73,7 +129,8 @@ def features(integral: np.ndarray, boxes) -> np.ndarray:
     boxes = np.asarray(boxes, dtype=float)
     margin = np.array(MARGIN) * boxes[:, 2:]
     around = np.concatenate([boxes[:, :2] - margin, boxes[:, 2:] + 2 * margin], axis=1)
-    cells = kernels.cell_means(integral, around, GRID)
+    integral, origin = channels(around) if callable(channels) else (channels, (0, 0))
+    cells = kernels.cell_means(integral, around, GRID, origin)
     orientations = cells[..., :N_ORIENTATIONS].reshape(len(boxes), -1)
     colors = cells[..., N_ORIENTATIONS:].reshape(len(boxes), -1)
     orientations /= np.linalg.norm(orientations, axis=1, keepdims=True) + 1e-6
@@ -113,26 +170,26 @@ class RidgeTemplate:
         self.rng, self.ridge, self.rate, self.anchor, self.n_samples = rng, ridge, rate, anchor, n_samples
         self.first = self.running = self.coefficients = None
 
-    def learn(self, integral: np.ndarray, box) -> None:
+    def learn(self, channels, box) -> None:
         """Learn from a frame in which the target's box is known, or believed to be."""
         if self.first is None:
-            self.first = self.running = self._moments(integral, box, 5 * self.n_samples)
+            self.first = self.running = self._moments(channels, box, 5 * self.n_samples)
         else:
-            new = self._moments(integral, box, self.n_samples)
+            new = self._moments(channels, box, self.n_samples)
             self.running = (1 - self.rate) * self.running + self.rate * new
         both = self.anchor * self.first + (1 - self.anchor) * self.running
         diagonal = np.arange(len(both))
         both[diagonal, diagonal] += self.ridge * self.first[diagonal, diagonal].mean()
         self.coefficients = np.linalg.solve(both[:, :-1], both[:, -1])
 
-    def predict(self, integral: np.ndarray, boxes) -> np.ndarray:
+    def predict(self, channels, boxes) -> np.ndarray:
         """Predicted overlap of each of many boxes with the target, about 0 to 1."""
-        return features(integral, boxes) @ self.coefficients
+        return features(channels, boxes) @ self.coefficients
 
-    def _moments(self, integral, box, n_samples) -> np.ndarray:
+    def _moments(self, channels, box, n_samples) -> np.ndarray:
         """Means of the products of features with each other and, in the last column, with the overlap."""
         boxes = self._around(np.asarray(box, dtype=float), n_samples)
-        look, y = features(integral, boxes), metrics.overlap(boxes, np.tile(box, (len(boxes), 1)))
+        look, y = features(channels, boxes), metrics.overlap(boxes, np.tile(box, (len(boxes), 1)))
         weights = np.ones(len(y))
         weights[0] = 4  # the box itself counts as four
         weighted = look * (weights / weights.sum())[:, None]

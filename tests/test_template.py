@@ -1,5 +1,6 @@
 """The ridge template against sums over pixels and against the objective that it minimises."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -27,6 +28,28 @@ def test_image_is_reduced_to_the_target_but_never_enlarged(width, side):
     integral, found = template.reduced_channels(np.zeros((241, 320, 3), np.uint8), width)
     assert found == side
     assert integral.shape == (241 // side + 1, 320 // side + 1, 9)
+
+
+@pytest.mark.parametrize("width", [20, 50, 80])
+def test_channels_of_a_part_are_those_of_the_whole(width):
+    """To the bit, also at the border, for boxes that reach beyond it, and when a second request needs more."""
+    rng = np.random.default_rng(3)
+    frame = cv2.GaussianBlur(rng.integers(0, 256, (241, 322, 3), dtype=np.uint8), (0, 0), 2)
+    whole, side = template.reduced_channels(frame, width)
+    part = template.PartialChannels(frame, width)
+    assert part.side == side
+    for left, top in [(120, 90), (130, 95), (-30, -20), (290, 200), (5, 150), (400, -300), (-200, 90)]:
+        corners = np.array([left, top]) + rng.uniform(0, 15, (8, 2))
+        boxes = np.hstack([corners, np.full((8, 2), [width, 2.5 * width])]) / side
+        np.testing.assert_array_equal(template.features(part, boxes), template.features(whole, boxes))
+
+
+def test_a_part_that_has_been_made_serves_again():
+    part = template.PartialChannels(np.zeros((200, 300, 3), np.uint8), 24)
+    large = part([[100, 50, 24, 60], [120, 60, 24, 60]])
+    assert part([[110, 55, 24, 60]])[0] is large[0]
+    assert part([[50, 55, 24, 60]])[0] is not large[0]
+    assert large[0].size < 301 * 201 * 9 / 5
 
 
 def test_coefficients_minimise_the_penalised_squared_error(monkeypatch, scene, integral):

@@ -60,23 +60,34 @@ class Description(Prepared):
 
     Attributes
     ----------
+    bins : ndarray, shape (H, W), uint8, or None
+        Histogram bin of every pixel, where they are made of the whole frame.
     frame : ndarray, shape (H, W, 3), uint8
         The frame itself.
     gray : ndarray, uint8
         A reduced grey copy, to see how the camera moves.
     shift : ndarray, shape (2,)
         How far the background has moved since the frame before, in pixels.
+    whole : bool
+        Whether bins and channels are those of the whole frame, to be shared, and not of the parts asked for.
     """
 
     frame: np.ndarray
     gray: np.ndarray
     shift: np.ndarray
+    whole: bool
     _channels: dict = field(default_factory=dict)
 
-    def channels(self, width: float) -> tuple[np.ndarray, int]:
-        """Return the integral channels for a target of a given width, and the side of their pixels."""
+    @property
+    def picture(self) -> np.ndarray:
+        """The bin image, or the frame where only the parts that are asked for shall be binned."""
+        return self.bins if self.whole else self.frame
+
+    def channels(self, width: float) -> tuple[np.ndarray | template.PartialChannels, int]:
+        """Return the channels for a target of a given width, and the side of their pixels."""
         if width not in self._channels:
-            self._channels[width] = template.reduced_channels(self.frame, width)
+            part = None if self.whole else template.PartialChannels(self.frame, width)
+            self._channels[width] = (part, part.side) if part else template.reduced_channels(self.frame, width)
         return self._channels[width]
 
 
@@ -196,12 +207,16 @@ class RobustParticleFilter:
         ValueError
             If the frame is unusable.
         """
+        return self._describe(frame, whole=True)
+
+    def _describe(self, frame: np.ndarray, whole: bool) -> Description:
         frame = check_frame(frame)
         before, self._gray = self._gray, motion.reduced_gray(frame)
         shift = np.zeros(2)
         if before is not None and before.shape == self._gray.shape:
             shift = motion.camera_shift(before, self._gray) * frame.shape[1] / self._gray.shape[1]
-        return Description(frame.shape, color.hsv_bins(frame), frame, self._gray, shift)
+        bins = color.hsv_bins(frame) if whole else None
+        return Description(frame.shape, bins, frame, self._gray, shift, whole)
 
     def init(self, frame: np.ndarray | Description, box) -> Estimate:
         """Learn the target's colours and shape, and place all particles on it.
@@ -278,7 +293,7 @@ class RobustParticleFilter:
         return self._n_bad >= self.patience
 
     def _look(self, frame) -> Description:
-        return frame if isinstance(frame, Description) else self.prepare(frame)
+        return frame if isinstance(frame, Description) else self._describe(frame, whole=False)
 
     def _boxes(self, particles: np.ndarray) -> np.ndarray:
         sizes = particles[:, 2:] * self.size
@@ -327,17 +342,18 @@ class RobustParticleFilter:
     def _histograms(self, look: Description, box: np.ndarray) -> np.ndarray:
         """Histogram of each band of one box, shape (n_bands, 256)."""
         edges = self._bands(box[None])
-        return color.histograms(look.bins, np.column_stack([edges[:, :2], edges[:, 2:] - edges[:, :2]]), "ignore")
+        return color.histograms(look.picture, np.column_stack([edges[:, :2], edges[:, 2:] - edges[:, :2]]), "ignore")
 
     def _cues(self, look: Description, boxes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Root mean square Hellinger distance of the bands, and the template's prediction, of each box."""
         edges = self._bands(boxes)
-        similarity = kernels.similarities(look.bins, edges, self.palette).reshape(len(boxes), -1)
-        distances = np.sqrt(1 - similarity.mean(axis=1))
+        bins, origin = color.covered_bins(look.picture, edges)
+        similarity = kernels.similarities(bins, edges, self.palette, origin=origin)
+        distances = np.sqrt(1 - similarity.reshape(len(boxes), -1).mean(axis=1))
         if self.template is None:
             return distances, np.zeros(len(boxes))
-        integral, side = look.channels(self.size[0])
-        return distances, self.template.predict(integral, boxes / side)
+        channels, side = look.channels(self.size[0])
+        return distances, self.template.predict(channels, boxes / side)
 
     def _judge_and_learn(self, look: Description, box: np.ndarray, distance: float, fit: float) -> None:
         """Compare both cues at the estimate with their running levels, and learn from a good frame."""
@@ -365,5 +381,5 @@ class RobustParticleFilter:
             self.palette = kernels.palette(KEPT * self._first_targets + (1 - KEPT) * self._running_targets)
 
     def _learn_template(self, look: Description, box: np.ndarray) -> None:
-        integral, side = look.channels(self.size[0])
-        self.template.learn(integral, box / side)
+        channels, side = look.channels(self.size[0])
+        self.template.learn(channels, box / side)
