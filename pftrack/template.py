@@ -28,7 +28,7 @@ MARGIN = 0.1, 0.04
 """Surroundings of the box that the grid takes in on each side, relative to its width and height."""
 
 REACH = 6
-"""How far beyond a box, in reduced pixels, the picture matters: for rounding, gradients and their mean nearby."""
+"""Reduced pixels beyond a box that matter for it, through rounding, gradients and the mean gradient nearby."""
 
 WIDTH = 24
 """Width of the target, in pixels, in the reduced image from which channels are taken."""
