@@ -239,7 +239,7 @@ def log_likelihood(frame: np.ndarray, boxes, target: np.ndarray, sigma: float, o
 
     .. math:: \log p(z_t \mid s_t^{(n)}) = -\frac{(d_t^{(n)})^2}{2\sigma^2} - \log(\sigma\sqrt{2\pi})
 
-    Chapter 5 weighs its particles with it; the trackers do the same in :func:`pftrack.kernels.observe`.
+    Chapter 5 weighs its particles with it; its tracker does the same in :func:`pftrack.kernels.observe`.
 
     Parameters
     ----------

@@ -677,8 +677,8 @@ def _match_loop(counts, roots, n_visible):
 def _direct_loop(bins, regions, used, roots):
     """Count the pixels of each region by themselves.
 
-    Neighbours often have the same bin, and a counter that has just been raised may have to be waited for: four take
-    turns.
+    Four counters a bin take turns along a row: in a real picture, whose neighbouring pixels are often but not always
+    alike, that halves the time (chapter 7 measures it).
     """
     totals = np.empty(len(regions))
     counts, own = np.empty((4, 256), dtype=np.int32), np.zeros(roots.shape[1], dtype=np.int32)

@@ -190,8 +190,13 @@ def learn(frames, boxes, bandwidth: float = 0.18, n_segments: int = 200, compact
     >>> learn([frame], [[30, 20, 10, 20]]).confidences
     array([-1.,  1.])
     """
+    frames, boxes = list(frames), np.asarray(boxes, dtype=float)
+    if not frames or boxes.shape != (len(frames), 4):
+        raise ValueError(
+            f"need at least one frame and one box for each, got {len(frames)} frames and boxes {boxes.shape}"
+        )
     features, inside, outside = [], [], []
-    for frame, box in zip(frames, np.asarray(boxes, dtype=float), strict=True):
+    for frame, box in zip(frames, boxes, strict=True):
         left, top, right, bottom = surroundings(box, frame.shape)
         part = frame[top:bottom, left:right]
         labels = segment(part, n_segments, compactness)
@@ -200,8 +205,6 @@ def learn(frames, boxes, bandwidth: float = 0.18, n_segments: int = 200, compact
         of_target = np.bincount(labels[y0:y1, x0:x1].ravel(), minlength=len(features[-1]))
         inside.append(of_target)
         outside.append(np.bincount(labels.ravel()) - of_target)
-    if not features:
-        raise ValueError("there are no frames to learn from")
     features, inside, outside = (np.concatenate(parts) for parts in (features, inside, outside))
     centers = codebook.mean_shift(features, bandwidth)
     cluster = codebook.nearest_words(features, centers)

@@ -5,9 +5,9 @@ describes the surroundings of a pixel by which of its neighbours on a ring are a
 
 .. math:: \mathrm{LBP} = \sum_{p=0}^{7} [g_p \ge g_c]\, 2^p
 
-A change of illumination that keeps the order of the grey levels changes nothing. Nine of ten patterns in natural images
-are *uniform*: on the way round the ring, brighter and darker change at most twice. Each of these 58 has a label of its
-own, and all others share the last. Li et al. 2012 and 2016 put histograms of them beside those of colour.
+A change of illumination that keeps the order of the grey levels changes nothing. Most patterns in natural images are
+*uniform*: on the way round the ring, brighter and darker change at most twice. Each of these 58 has a label of its own,
+and all others share the last. Li et al. 2012 and 2016 put histograms of them beside those of colour.
 
 The ring here is that of the eight nearest pixels. Other variants, as scikit-image's, interpolate on a circle.
 """

@@ -143,7 +143,6 @@ class ColorParticleFilter:
         self.resample_threshold, self.lost_distance = resample_threshold, lost_distance
         self.scale_range, self.scale_limits = scale_range, scale_limits
         self.outside, self.resampler = outside, smc.RESAMPLERS[resampler]
-        self.target = None
         self._shape = None
 
     def prepare(self, frame: np.ndarray) -> Prepared:
@@ -192,8 +191,7 @@ class ColorParticleFilter:
         frame = check_frame(frame)
         box = check_box(box, frame)
         self.rng = np.random.default_rng(self.seed)
-        self.target = color.histograms(_picture(frame), [box], outside="ignore")[0]
-        self.palette = kernels.palette(self.target)
+        self.palette = kernels.palette(color.histograms(_picture(frame), [box], outside="ignore"))
         self.size = box[2:]
         self.noise_in_pixels = self.noise * [box[2], box[2], box[2], box[2], 1.0]
         self.particles = np.tile([*(box[:2] + box[2:] / 2), 0.0, 0.0, 1.0], (self.n_particles, 1))

@@ -61,33 +61,33 @@ class Description(Prepared):
     Attributes
     ----------
     bins : ndarray, shape (H, W), uint8, or None
-        Histogram bin of every pixel, where they are made of the whole frame.
+        Histogram bin of every pixel; None where bins and channels are made only of the parts that are asked for.
     frame : ndarray, shape (H, W, 3), uint8
         The frame itself.
     gray : ndarray, uint8
         A reduced grey copy, to see how the camera moves.
     shift : ndarray, shape (2,)
         How far the background has moved since the frame before, in pixels.
-    whole : bool
-        Whether bins and channels are those of the whole frame, to be shared, and not of the parts asked for.
     """
 
     frame: np.ndarray
     gray: np.ndarray
     shift: np.ndarray
-    whole: bool
     _channels: dict = field(default_factory=dict)
 
     @property
     def picture(self) -> np.ndarray:
-        """The bin image, or the frame where only the parts that are asked for shall be binned."""
-        return self.bins if self.whole else self.frame
+        """The bin image, or the frame where there is none."""
+        return self.frame if self.bins is None else self.bins
 
     def channels(self, width: float) -> tuple[np.ndarray | template.PartialChannels, int]:
         """Return the channels for a target of a given width, and the side of their pixels."""
         if width not in self._channels:
-            part = None if self.whole else template.PartialChannels(self.frame, width)
-            self._channels[width] = (part, part.side) if part else template.reduced_channels(self.frame, width)
+            if self.bins is None:
+                part = template.PartialChannels(self.frame, width)
+                self._channels[width] = part, part.side
+            else:
+                self._channels[width] = template.reduced_channels(self.frame, width)
         return self._channels[width]
 
 
@@ -216,7 +216,7 @@ class RobustParticleFilter:
         if before is not None and before.shape == self._gray.shape:
             shift = motion.camera_shift(before, self._gray) * frame.shape[1] / self._gray.shape[1]
         bins = color.hsv_bins(frame) if whole else None
-        return Description(frame.shape, bins, frame, self._gray, shift, whole)
+        return Description(frame.shape, bins, frame, self._gray, shift)
 
     def init(self, frame: np.ndarray | Description, box) -> Estimate:
         """Learn the target's colours and shape, and place all particles on it.
