@@ -65,3 +65,50 @@ def pattern_bins(frame: np.ndarray) -> np.ndarray:
     if frame.ndim == 3 and frame.shape[2] == 3 and frame.size:
         frame = cv2.cvtColor(np.ascontiguousarray(frame), cv2.COLOR_BGR2GRAY)
     return kernels.ring_image(frame, _UNIFORM_LABELS)
+
+
+def patch_histograms(patterns: np.ndarray, size: int = 12, step: int = 4) -> np.ndarray:
+    """Normalised histogram of the patterns in every square patch on a grid.
+
+    Parameters
+    ----------
+    patterns : ndarray, shape (H, W), uint8
+        From :func:`pattern_bins`.
+    size : int
+        Side of a patch in pixels, a multiple of `step`. 12 is that of Bag of Features Tracking (Yang et al. 2010).
+    step : int
+        Distance from one patch to the next in pixels, at least 1.
+
+    Returns
+    -------
+    ndarray, shape (R, C, 59)
+        Shares of the pixels with each label. Patch ``[r, c]`` has its top left pixel at ``(c * step, r * step)``; there
+        are as many rows and columns of patches as fit into the picture, and none if it is smaller than a patch.
+
+    Raises
+    ------
+    ValueError
+        If `size` is not a positive multiple of `step`, or the picture is not one of labels.
+
+    Examples
+    --------
+    >>> flat = pattern_bins(np.zeros((20, 24), dtype=np.uint8))
+    >>> shares = patch_histograms(flat)
+    >>> shares.shape, shares[0, 0, 57]
+    ((3, 4, 59), np.float64(1.0))
+    """
+    if step < 1 or size < 1 or size % step:
+        raise ValueError(f"size must be a positive multiple of step, got {size} and {step}")
+    if patterns.ndim != 2 or patterns.max(initial=0) >= N_PATTERNS:
+        raise ValueError(f"need a picture (H, W) of labels below {N_PATTERNS}, got shape {patterns.shape}")
+    n_rows, n_columns = (max(side // step, 0) for side in patterns.shape)
+    span = size // step
+    if n_rows < span or n_columns < span:
+        return np.zeros((max(n_rows - span + 1, 0), max(n_columns - span + 1, 0), N_PATTERNS))
+    used = patterns[: n_rows * step, : n_columns * step].astype(int)
+    cells = (np.arange(n_rows * step) // step)[:, None] * n_columns + np.arange(n_columns * step) // step
+    counts = np.bincount((cells * N_PATTERNS + used).ravel(), minlength=n_rows * n_columns * N_PATTERNS)
+    sums = np.zeros((n_rows + 1, n_columns + 1, N_PATTERNS))
+    sums[1:, 1:] = counts.reshape(n_rows, n_columns, N_PATTERNS).cumsum(axis=0).cumsum(axis=1)
+    inside = sums[span:, span:] - sums[:-span, span:] - sums[span:, :-span] + sums[:-span, :-span]
+    return inside / size**2

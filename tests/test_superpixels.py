@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pftrack import color, datasets, superpixels
+from pftrack import color, datasets, metrics, superpixels
 
 
 @pytest.fixture(scope="module")
@@ -96,3 +96,35 @@ def test_what_cannot_be_learnt_from_is_refused(film):
         superpixels.histograms(np.zeros((2, 2), np.uint8), np.zeros((3, 3), int))
     with pytest.raises(ValueError, match="spread"):
         superpixels.confidences([[1.0]], superpixels.PriorKnowledge(np.eye(1), np.ones(1), np.ones(1)), spread=-1)
+
+
+def test_drawn_boxes_lie_in_the_surroundings(film):
+    frames, boxes = film
+    left, top, right, bottom = superpixels.surroundings(boxes[0], frames[0].shape)
+    drawn = superpixels.sample_boxes(boxes[0], frames[0].shape, 400, np.random.default_rng(0))
+    assert (drawn[:, :2] >= [left, top]).all()
+    assert (drawn[:, :2] + drawn[:, 2:] <= [right, bottom]).all()
+    np.testing.assert_array_equal(drawn[:, 2:], np.tile(boxes[0, 2:], (400, 1)))
+    free = [right - left, bottom - top] - boxes[0, 2:]
+    np.testing.assert_allclose(np.ptp(drawn[:, :2], axis=0), free, rtol=0.05)
+
+
+def test_a_box_sums_up_the_pixels_it_shows():
+    rng = np.random.default_rng(0)
+    painted = rng.uniform(-1, 1, (30, 40))
+    boxes = np.column_stack([rng.uniform(-10, 35, 50), rng.uniform(-10, 25, 50), rng.uniform(2, 20, (50, 2))])
+    wide = np.pad(painted, 40, constant_values=-1.0)  # beyond the frame all is background
+    sums, centers = superpixels.box_confidences(painted, boxes), superpixels.box_confidences(painted, boxes, True)
+    for n, (left, top, right, bottom) in enumerate(color.pixel_edges(boxes) + 40):
+        assert sums[n] == pytest.approx(wide[top:bottom, left:right].sum())
+        x, y = np.floor(boxes[n, :2] + boxes[n, 2:] / 2).astype(int) + 40
+        assert centers[n] == wide[y, x]
+
+
+def test_the_best_of_the_drawn_boxes_is_near_the_target(film):
+    frames, boxes = film
+    prior = superpixels.learn(frames[:5], boxes[:5])
+    painted = superpixels.confidence_map(frames[6], boxes[5], prior)
+    drawn = superpixels.sample_boxes(boxes[5], painted.shape, 300, np.random.default_rng(0))
+    best = drawn[superpixels.box_confidences(painted, drawn).argmax()]
+    assert metrics.overlap(best[None], boxes[6:7])[0] > 0.7

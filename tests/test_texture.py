@@ -65,3 +65,26 @@ def test_what_is_no_picture_is_refused(wrong):
 
 def test_a_picture_of_nothing_has_no_patterns():
     assert texture.pattern_bins(np.zeros((0, 5, 3), np.uint8)[..., 0]).shape == (0, 5)
+
+
+@pytest.mark.parametrize(("size", "step"), [(12, 4), (6, 6), (5, 1)])
+def test_patches_are_counted_where_they_are(gray, size, step):
+    patterns = texture.pattern_bins(gray)
+    shares = texture.patch_histograms(patterns, size, step)
+    assert shares.shape == ((30 - size) // step + 1, (40 - size) // step + 1, 59)
+    for r, c in np.ndindex(shares.shape[:2]):
+        patch = patterns[r * step : r * step + size, c * step : c * step + size]
+        np.testing.assert_allclose(shares[r, c] * size**2, np.bincount(patch.ravel(), minlength=59))
+
+
+def test_in_a_picture_smaller_than_a_patch_there_is_none():
+    assert texture.patch_histograms(np.zeros((5, 40), np.uint8)).shape == (0, 8, 59)
+    assert texture.patch_histograms(np.zeros((0, 3), np.uint8)).shape == (0, 0, 59)
+
+
+def test_patches_off_the_grid_and_pictures_without_labels_are_refused():
+    for size, step in [(12, 5), (0, 1), (4, 0)]:
+        with pytest.raises(ValueError, match="multiple of step"):
+            texture.patch_histograms(np.zeros((20, 20), np.uint8), size, step)
+    with pytest.raises(ValueError, match="labels below 59"):
+        texture.patch_histograms(np.full((20, 20), 59, np.uint8))
