@@ -130,7 +130,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         default="all",
         metavar="TABLE-OR-FIGURE",
-        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, or all of them (the default)",
+        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, or all of them (the default)",
     )
     reproduce.add_argument(
         "--results", type=Path, default=Path("results"), metavar="DIR", help="where to write (results)"

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 LARGEST_GROUP = 10
 """Most runs that share a pass through the film, unless said otherwise."""
 
-UPPER_ROOMS = ("cli.py", "explore.py", "masks.py", "plots.py", "reproduce.py", "video.py")
-"""Files that trackers and datasets do not build on, so that a change of them leaves every box as it is."""
+UPPER_ROOMS = ("cli.py", "explore.py", "masks.py", "plots.py", "reproduce", "video.py")
+"""Files and folders that trackers and datasets do not build on, so that a change of them leaves every box as it is."""
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -446,7 +446,9 @@ def library_digest(folder: Path) -> str:
     digest = hashlib.sha256()
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.suffix in (".py", ".txt") and name not in UPPER_ROOMS:  # the .txt hold the checksums of the footage
+        if (
+            path.suffix in (".py", ".txt") and name.split("/")[0] not in UPPER_ROOMS
+        ):  # the .txt hold the checksums of the footage
             digest.update(f"{name}\n{hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
     numba = importlib.metadata.version("numba") if importlib.util.find_spec("numba") else None
     digest.update(f"numpy {np.__version__}, opencv {cv2.__version__}, numba {numba}".encode())

@@ -30,7 +30,8 @@ from numba import njit
 from tqdm.auto import tqdm
 
 from pftrack import color, files, metrics
-from pftrack.trackers.base import check_box, check_frame
+from pftrack.checks import check_box
+from pftrack.trackers.base import check_frame
 
 N_HUES = 16
 """Hue bins of OpenCV's CAMSHIFT sample."""

@@ -54,6 +54,40 @@ def overlap(boxes, truth) -> np.ndarray:
     return rate
 
 
+def pairwise_overlap(a, b) -> np.ndarray:
+    """Intersection over union of every box of one set with every box of another.
+
+    Parameters
+    ----------
+    a, b : array_like, shapes (N, 4) and (M, 4)
+        Boxes ``(x, y, w, h)`` in pixels, not NaN.
+
+    Returns
+    -------
+    ndarray, shape (N, M)
+        Overlap between 0 and 1.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are others.
+
+    Examples
+    --------
+    >>> pairwise_overlap([[0, 0, 2, 2]], [[1, 0, 2, 2], [5, 5, 1, 1]]).round(3)
+    array([[0.333, 0.   ]])
+    """
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if a.ndim != 2 or a.shape[1] != 4 or b.ndim != 2 or b.shape[1] != 4:
+        raise ValueError(f"boxes must have shapes (N, 4) and (M, 4), got {a.shape} and {b.shape}")
+    a, b = a[:, None], b[None]
+    low = np.maximum(a[..., :2], b[..., :2])
+    high = np.minimum(a[..., :2] + a[..., 2:], b[..., :2] + b[..., 2:])
+    intersection = np.prod(np.maximum(high - low, 0.0), axis=-1)
+    union = np.prod(a[..., 2:], axis=-1) + np.prod(b[..., 2:], axis=-1) - intersection
+    return np.divide(intersection, union, out=np.zeros(union.shape), where=union > 0)
+
+
 def center_error(boxes, truth) -> np.ndarray:
     """Distance between the centres of two sequences of boxes, frame by frame.
 
@@ -155,6 +189,71 @@ def single_target(boxes, truth) -> SingleTargetScore:
         hit_ratio_visible=float((rates[visible] >= HIT_OVERLAP).mean()),
         center_error_mean=float(errors.mean()) if errors.size else float("nan"),
         center_error_rms=float(np.sqrt(np.mean(errors**2))) if errors.size else float("nan"),
+    )
+
+
+@dataclass(frozen=True)
+class DetectionScore:
+    """How good detections are, from :func:`detections`.
+
+    Attributes
+    ----------
+    n_truth, n_found, n_matched : int
+        Number of true boxes, of detections, and of pairs of both that overlap enough.
+    recall, precision : float
+        Share of the true boxes that were found, and of the detections that are right; NaN of nothing.
+    overlap : float
+        Mean overlap of the pairs.
+    """
+
+    n_truth: int
+    n_found: int
+    n_matched: int
+    recall: float
+    precision: float
+    overlap: float
+
+
+def detections(found, truth, min_overlap: float = 0.5) -> DetectionScore:
+    """Score detections against the truth.
+
+    Parameters
+    ----------
+    found, truth : array_like, shape (R, 7)
+        Tables of detections and of tracks, ``frame, id, x, y, w, h, score``; ids and scores are not looked at.
+    min_overlap : float
+        Least overlap of a pair, above 0. In every frame pairs are one to one, and chosen for the largest sum of
+        overlaps.
+
+    Returns
+    -------
+    DetectionScore
+        Recall, precision and mean overlap.
+
+    Examples
+    --------
+    >>> truth = [[0, 1, 0, 0, 10, 20, 1], [1, 1, 0, 0, 10, 20, 1]]
+    >>> score = detections([[0, -1, 0, 0, 10, 16, 0.7]], truth)
+    >>> score.recall, score.precision, score.overlap
+    (0.5, 1.0, 0.8)
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    found, truth = (np.asarray(table, dtype=float).reshape(-1, 7) for table in (found, truth))
+    overlaps = []
+    for t in np.intersect1d(found[:, 0], truth[:, 0]):
+        rates = pairwise_overlap(found[found[:, 0] == t, 2:6], truth[truth[:, 0] == t, 2:6])
+        rates[rates < min_overlap] = 0.0
+        paired = rates[linear_sum_assignment(rates, maximize=True)]
+        overlaps.extend(paired[paired > 0].tolist())
+    n = len(overlaps)
+    return DetectionScore(
+        n_truth=len(truth),
+        n_found=len(found),
+        n_matched=n,
+        recall=n / len(truth) if len(truth) else np.nan,
+        precision=n / len(found) if len(found) else np.nan,
+        overlap=float(np.mean(overlaps)) if n else np.nan,
     )
 
 

@@ -60,7 +60,7 @@ def plan(tmp_path, monkeypatch) -> Plan:
     """A small plan on the short scene, in this process."""
     short = scene()
     monkeypatch.setattr(datasets, "load", lambda id, progress=True: short)
-    return Plan(tmp_path / "results", 3, 1, SCENE, (4, 8), MASKS, tmp_path / "store", progress=False)
+    return Plan(tmp_path / "results", 3, 1, SCENE, SCENE, (4, 8), MASKS, tmp_path / "store", progress=False)
 
 
 def made(item: str, plan: Plan) -> list[pd.DataFrame]:
@@ -321,7 +321,7 @@ def test_sensitivity_has_the_mean_and_spread_of_every_value(plan, monkeypatch):
         ("sigma", 0.2, {"sigma": 0.2}),
         ("lost_distance", 0.5, {"lost_distance": 0.5}),
     ]
-    monkeypatch.setattr(reproduce, "variations", lambda: tried)
+    monkeypatch.setattr(reproduce.one, "variations", lambda: tried)
     (table,) = made("sensitivity", plan)
     assert table["setting"].tolist() == ["sigma", "sigma", "lost_distance"]
     assert table["value"].tolist() == [0.1, 0.2, 0.5]

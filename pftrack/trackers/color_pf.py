@@ -13,7 +13,8 @@ import math
 import numpy as np
 
 from pftrack import color, kernels, motion, smc
-from pftrack.trackers.base import Estimate, Prepared, check_box, check_frame, check_seed, check_started
+from pftrack.checks import check_box, check_seed
+from pftrack.trackers.base import Estimate, Prepared, check_frame, check_started
 
 
 def particle_boxes(particles, size) -> np.ndarray:

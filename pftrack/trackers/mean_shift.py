@@ -9,8 +9,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from pftrack.checks import check_box
 from pftrack.color import back_projection, masked_histogram, pixel_edges
-from pftrack.trackers.base import Estimate, check_box, check_frame, check_started
+from pftrack.trackers.base import Estimate, check_frame, check_started
 
 
 class MeanShiftTracker:

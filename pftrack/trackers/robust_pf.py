@@ -24,7 +24,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pftrack import color, kernels, motion, smc, template
-from pftrack.trackers.base import Estimate, Prepared, check_box, check_frame, check_seed, check_started
+from pftrack.checks import check_box, check_seed
+from pftrack.trackers.base import Estimate, Prepared, check_frame, check_started
 
 SCALE_LIMITS = 0.3, 3.0
 """Bounds of the scale, relative to the first frame."""

@@ -6,8 +6,9 @@ import pytest
 
 import pftrack
 from pftrack import datasets
+from pftrack.checks import check_box
 from pftrack.trackers import TRACKERS, Estimate, follow, track
-from pftrack.trackers.base import check_box, check_frame
+from pftrack.trackers.base import check_frame
 
 WIDTH, HEIGHT = 80, 60
 BOX = (30.0, 20.0, 10.0, 20.0)
