@@ -10,7 +10,9 @@ The library behind the book. A tracker is started on the first frame and updated
 10
 """
 
-from pftrack import color, datasets, metrics, motion, smc
+from pftrack import color, datasets, detection, metrics, motion, multi, smc
+from pftrack.detection import PedestrianDetector
+from pftrack.multi import BagOfFeaturesParticleFilter, Track
 from pftrack.trackers import (
     CamShiftTracker,
     ColorParticleFilter,
@@ -24,16 +26,21 @@ from pftrack.trackers import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "BagOfFeaturesParticleFilter",
     "CamShiftTracker",
     "ColorParticleFilter",
     "Estimate",
     "MeanShiftTracker",
+    "PedestrianDetector",
     "RobustParticleFilter",
+    "Track",
     "color",
     "datasets",
+    "detection",
     "follow",
     "metrics",
     "motion",
+    "multi",
     "smc",
     "track",
 ]

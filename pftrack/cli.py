@@ -1,4 +1,4 @@
-"""The ``pftrack`` command: track a target, score a result, fetch footage, reproduce what the book shows.
+"""The ``pftrack`` command: track a target or many, score a result, fetch footage, reproduce what the book shows.
 
 Errors are one line on standard error and exit status 2; an interrupt leaves no half-written file.
 """
@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from pftrack import datasets, files, metrics, trackers, video
-from pftrack.datasets import registry
+from pftrack import datasets, files, metrics, multi, trackers, video
+from pftrack.datasets import readers, registry
+from pftrack.multi import MULTI_TRACKERS, Track
 from pftrack.trackers import TRACKERS, Estimate
 from pftrack.trackers.base import MISSING
 
@@ -113,6 +114,16 @@ def _parser() -> argparse.ArgumentParser:
     track.add_argument("--video", type=Path, metavar="FILE", help="write an annotated MP4")
     track.set_defaults(run=_track)
 
+    many = commands.add_parser("multi", help="follow many pedestrians through a film")
+    many.add_argument("source", metavar="SOURCE", help="a dataset id, a video file, or a folder of images")
+    many.add_argument("--tracker", default="bof-pf", metavar="NAME", help=", ".join(MULTI_TRACKERS))
+    many.add_argument("--particles", type=int, metavar="N", help="particles of each target (300)")
+    many.add_argument("--seed", type=int, metavar="S", help="seed of the random numbers (0)")
+    many.add_argument("--detections", type=Path, metavar="FILE", help="MOTChallenge detections, in place of our own")
+    many.add_argument("--mot", type=Path, metavar="FILE", help="write MOTChallenge rows, frames from 1")
+    many.add_argument("--video", type=Path, metavar="FILE", help="write an annotated MP4")
+    many.set_defaults(run=_multi)
+
     evaluate = commands.add_parser("evaluate", help="score a result against the truth")
     evaluate.add_argument("result", type=Path, metavar="RESULT", help="a CSV written by pftrack track")
     evaluate.add_argument("truth", metavar="TRUTH", help="a dataset id, or a CSV of the same form")
@@ -130,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         default="all",
         metavar="TABLE-OR-FIGURE",
-        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, or all of them (the default)",
+        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, bof, or all of them (the default)",
     )
     reproduce.add_argument(
         "--results", type=Path, default=Path("results"), metavar="DIR", help="where to write (results)"
@@ -149,7 +160,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _track(options: argparse.Namespace) -> None:
     tracker = _make_tracker(options)
-    frames, box, fps = _open_source(options)
+    frames, fps, sequence = _open_source(options)
+    box = _first_box(options, sequence)
     estimates: list[Estimate] = []
 
     def pictures() -> Iterator[np.ndarray]:
@@ -175,32 +187,37 @@ def _track(options: argparse.Namespace) -> None:
         print(f"the film announces {len(frames)} frames but ends {n_unread} early; those count as lost")
 
 
-def _make_tracker(options: argparse.Namespace) -> trackers.Tracker:
-    if options.tracker not in TRACKERS:
-        raise ValueError(f"unknown tracker {options.tracker!r}; choose one of {', '.join(TRACKERS)}")
+def _make_tracker(options: argparse.Namespace, kinds: dict[str, type] = TRACKERS):
+    if options.tracker not in kinds:
+        raise ValueError(f"unknown tracker {options.tracker!r}; choose one of {', '.join(kinds)}")
     settings = {"n_particles": options.particles, "seed": options.seed}
     settings = {name: value for name, value in settings.items() if value is not None}
     try:
-        return TRACKERS[options.tracker](**settings)
+        return kinds[options.tracker](**settings)
     except TypeError:
         raise ValueError(f"{options.tracker} has no particles and no seed") from None
 
 
-def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, np.ndarray, float]:
-    """Return frames, first box and frame rate of a dataset, a video or a folder."""
+def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, float, datasets.Sequence | None]:
+    """Return frames and frame rate of a dataset, a video or a folder, and the dataset if it is one."""
     if options.source in datasets.ids():
         sequence = _load(options.source)
-        frames, fps = sequence.frames, sequence.fps
-        box = sequence.boxes[0] if options.box is None else parse_box(options.box)
-        return frames, box, fps
+        return sequence.frames, sequence.fps, sequence
     if not Path(options.source).exists():
         raise FileNotFoundError(
             f"there is no file, folder or dataset {options.source!r}; the datasets are {', '.join(datasets.ids())}"
         )
     frames = datasets.open_frames(options.source)
-    if options.box is None:
+    return frames, getattr(frames, "fps", 25.0), None
+
+
+def _first_box(options: argparse.Namespace, sequence: datasets.Sequence | None) -> np.ndarray:
+    """Return where the target is in the first frame: what was said, or else what the dataset knows."""
+    if options.box is not None:
+        return parse_box(options.box)
+    if sequence is None:
         raise ValueError(f"say where the target is in the first frame of {options.source} with --box X,Y,W,H")
-    return frames, parse_box(options.box), getattr(frames, "fps", 25.0)
+    return sequence.boxes[0]
 
 
 def _load(id: str) -> datasets.Sequence:
@@ -275,6 +292,38 @@ def read_csv(path: Path) -> np.ndarray:
     except (KeyError, ValueError, TypeError, IndexError, MemoryError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV with the columns {','.join(CSV_COLUMNS)}") from error
     return boxes
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# pftrack multi
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def _multi(options: argparse.Namespace) -> None:
+    tracker = _make_tracker(options, MULTI_TRACKERS)
+    frames, fps, _ = _open_source(options)
+    detections = None if options.detections is None else readers.read_mot(options.detections)
+    found: list[list[Track]] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        """Annotate the frames one by one, collecting the tracks on the way."""
+        ahead, behind = itertools.tee(frames)
+        steps = zip(multi.follow(tracker, ahead, detections), behind, strict=False)
+        for tracks, frame in tqdm(steps, total=len(frames), unit="frame", disable=None):
+            found.append(tracks)
+            yield video.annotate_tracks(frame, tracks)
+
+    with contextlib.ExitStack() as outputs:  # both files appear, or neither
+        film, rows = (path and outputs.enter_context(files.replacing(path)) for path in (options.video, options.mot))
+        if film:
+            video.write(film, pictures(), fps)
+        else:
+            collections.deque(pictures(), maxlen=0)
+        if rows:
+            readers.write_mot(rows, multi.table(found))
+    print(f"{len(found)} frames, {len({track.id for tracks in found for track in tracks})} pedestrians")
+    if len(found) < len(frames):
+        print(f"the film announces {len(frames)} frames but ends {len(frames) - len(found)} early")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ The modes are the *words* of a *codebook*. How often each word is the nearest on
 image's *bag*, a histogram again, and two bags are compared by their intersection. A target changes its looks, so its
 codebook follows with a *forget factor*.
 
-The number of words is not chosen; the bandwidth is. Chapters 9 and 10 will use this.
+The number of words is not chosen; the bandwidth is. Chapters 9 and 10 use this.
 """
 
 from __future__ import annotations

@@ -257,6 +257,38 @@ def detections(found, truth, min_overlap: float = 0.5) -> DetectionScore:
     )
 
 
+def match_targets(tracks, truth, frame: int, min_overlap: float = 0.3) -> dict[int, int]:
+    """Tell which track is which target, by their overlap in one frame.
+
+    Parameters
+    ----------
+    tracks, truth : array_like, shape (R, 7)
+        Tables of tracks, ``frame, id, x, y, w, h, score``.
+    frame : int
+        The frame in which they are compared.
+    min_overlap : float
+        Least overlap of a pair.
+
+    Returns
+    -------
+    dict of int to int
+        Number of the track of each target that has one; one to one, for the largest sum of overlaps.
+
+    Examples
+    --------
+    >>> truth = [[0, 7, 0, 0, 10, 20, 1], [0, 8, 50, 0, 10, 20, 1]]
+    >>> match_targets([[0, 1, 51, 0, 10, 20, 1]], truth, frame=0)
+    {8: 1}
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    tracks, truth = (np.asarray(table, dtype=float).reshape(-1, 7) for table in (tracks, truth))
+    tracks, truth = tracks[tracks[:, 0] == frame], truth[truth[:, 0] == frame]
+    rates = pairwise_overlap(truth[:, 2:6], tracks[:, 2:6])
+    pairs = zip(*linear_sum_assignment(rates, maximize=True), strict=True)
+    return {int(truth[i, 1]): int(tracks[j, 1]) for i, j in pairs if rates[i, j] >= min_overlap}
+
+
 def _check_pair(boxes, truth) -> tuple[np.ndarray, np.ndarray]:
     boxes, truth = np.asarray(boxes, dtype=float), np.asarray(truth, dtype=float)
     if boxes.ndim != 2 or boxes.shape[1] != 4 or boxes.shape != truth.shape:

@@ -11,7 +11,7 @@ the cluster it is nearest to, the less the farther away it is (eq. 2),
 
 .. math:: C_s = e^{-\lambda \lVert f_s - c_i \rVert / r_i}\; C_i ,
 
-and painted over its pixels this is a *confidence map*. Wang et al. (2011) track by it. Chapter 9 will build it.
+and painted over its pixels this is a *confidence map*. Wang et al. (2011) track by it. Chapter 9 builds it.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def surroundings(box, shape, factor: float = FACTOR) -> tuple[int, int, int, int
     return left, top, right, bottom
 
 
-def segment(picture: np.ndarray, n_segments: int = 200, compactness: float = 10.0) -> np.ndarray:
+def segment(picture: np.ndarray, n_segments: int = 200, compactness: float = 10.0, n_steps: int = 10) -> np.ndarray:
     """Cut a picture into superpixels by SLIC, scikit-image's.
 
     Parameters
@@ -76,6 +76,8 @@ def segment(picture: np.ndarray, n_segments: int = 200, compactness: float = 10.
         About how many, at least 1; the paper's is 200. Of a small picture fewer are made, of nine pixels at least.
     compactness : float
         How much nearness counts against colour, above 0.
+    n_steps : int
+        Rounds of SLIC's clustering, at least 1.
 
     Returns
     -------
@@ -103,7 +105,7 @@ def segment(picture: np.ndarray, n_segments: int = 200, compactness: float = 10.
         )
     n_segments = max(min(n_segments, picture.shape[0] * picture.shape[1] // 9), 1)
     rgb = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_BGR2RGB)
-    labels = slic(rgb, n_segments=n_segments, compactness=compactness, start_label=0)
+    labels = slic(rgb, n_segments=n_segments, compactness=compactness, max_num_iter=n_steps, start_label=0)
     return np.unique(labels, return_inverse=True)[1].reshape(labels.shape)
 
 

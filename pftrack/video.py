@@ -127,3 +127,37 @@ def annotate(frame: np.ndarray, box, *, lost: bool = False, truth=None, particle
         cv2.putText(picture, "lost", (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 3, cv2.LINE_AA)
         cv2.putText(picture, "lost", (8, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (66, 228, 240), 2, cv2.LINE_AA)
     return picture
+
+
+TRACK_COLORS = ((0, 94, 213), (178, 114, 0), (115, 158, 0), (0, 159, 230), (167, 121, 204), (233, 180, 86))
+"""Colours of tracks by number, in BGR order: vermilion, blue, green, orange, purple and sky of Okabe and Ito."""
+
+
+def annotate_tracks(frame: np.ndarray, tracks, particles: bool = False) -> np.ndarray:
+    """Copy of a frame with the box and the number of every track drawn on it.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W, 3), uint8
+        The picture in BGR order.
+    tracks : list of pftrack.multi.Track
+        The tracks in it. The box of one that is held, because its target is hidden, is thin.
+    particles : bool
+        Whether to draw the particles too.
+
+    Returns
+    -------
+    ndarray, shape (H, W, 3), uint8
+        The annotated picture.
+    """
+    picture = frame.copy()
+    for track in tracks:
+        color = TRACK_COLORS[(track.id - 1) % len(TRACK_COLORS)]
+        for x, y in np.rint(track.particles[:, :2]).astype(int) if particles and track.particles is not None else ():
+            cv2.circle(picture, (int(x), int(y)), 1, color, -1, cv2.LINE_AA)
+        x, y, w, h = np.rint(track.box).astype(int).tolist()
+        cv2.rectangle(picture, (x, y), (x + w, y + h), color, 1 if track.held else 2)
+        at = (x + 2, y + 14) if y < 16 else (x, y - 4)
+        cv2.putText(picture, str(track.id), at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(picture, str(track.id), at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture

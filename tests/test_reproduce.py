@@ -60,7 +60,7 @@ def plan(tmp_path, monkeypatch) -> Plan:
     """A small plan on the short scene, in this process."""
     short = scene()
     monkeypatch.setattr(datasets, "load", lambda id, progress=True: short)
-    return Plan(tmp_path / "results", 3, 1, SCENE, SCENE, (4, 8), MASKS, tmp_path / "store", progress=False)
+    return Plan(tmp_path / "results", 3, 1, SCENE, SCENE, (SCENE,), (4, 8), MASKS, tmp_path / "store", progress=False)
 
 
 def made(item: str, plan: Plan) -> list[pd.DataFrame]:

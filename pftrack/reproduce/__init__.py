@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from pftrack.reproduce.many import detection
+from pftrack.reproduce.many import bof, bof_steps, detection, detectors
 from pftrack.reproduce.one import (
     BARE,
     PAPER,
@@ -43,6 +43,8 @@ __all__ = [
     "PARTICLES",
     "Plan",
     "ablation_steps",
+    "bof_steps",
+    "detectors",
     "machine",
     "read",
     "run",
@@ -59,6 +61,7 @@ ITEMS = {
     "sensitivity": sensitivity,
     "ablation": ablation,
     "detection": detection,
+    "bof": bof,
 }
 """What can be reproduced, by name, in the order in which ``all`` does it."""
 

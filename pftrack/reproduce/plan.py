@@ -38,7 +38,9 @@ class Plan:
     sequence : str
         Dataset id; the first target of it is followed.
     crowd : str
-        Dataset id of the film with many pedestrians.
+        Dataset id of the film with many pedestrians, for the detector.
+    followed : tuple of str
+        Dataset ids of the films in which many are followed.
     particles : tuple of int
         Numbers of particles of Fig. 3.
     masks : ndarray, shape (M, 4), or None
@@ -59,6 +61,7 @@ class Plan:
     n_jobs: int | None = None
     sequence: str = "bobot-I"
     crowd: str = "pets09-s2l1"
+    followed: tuple[str, ...] = ("bobot-J", "tud-campus", "pets09-s2l1")
     particles: tuple[int, ...] = PARTICLES
     masks: np.ndarray | None = None
     store: Path | None = None
