@@ -35,7 +35,7 @@ WINDOW = (64, 128)
 """Width and height of OpenCV's people window, in pixels."""
 
 TRIM = (0.2, 0.1, 0.6, 0.77)
-"""Where in a window the person stands: left, top, width and height as shares of it."""
+"""Where in a window the person stands, by the shares of it that are left, top, width and height."""
 
 ASPECT = 0.36
 """Width of a person, relative to the height."""
@@ -67,7 +67,7 @@ class MotionMask:
     history : int
         Frames over which a background is learnt.
     threshold : float
-        Difference of grey levels that is motion, for the frame difference.
+        Difference in one of the colours, from 0 to 255, that is motion for the frame difference.
 
     Raises
     ------
@@ -77,6 +77,9 @@ class MotionMask:
     Notes
     -----
     In the first frame, and until a background is known, everything moves.
+
+    OpenCV's k nearest neighbours draw which pixels to remember from OpenCV's one global generator, and take no other.
+    So that a film has one answer, that generator is set to the frame's number before each frame.
 
     Examples
     --------
@@ -94,7 +97,7 @@ class MotionMask:
             self._model = cv2.createBackgroundSubtractorKNN(history, dist2Threshold=400.0, detectShadows=False)
         elif method == "mog2":
             self._model = cv2.createBackgroundSubtractorMOG2(history, varThreshold=25.0, detectShadows=False)
-        self._before = None
+        self._before, self._n_frames = None, 0
 
     def __call__(self, frame: np.ndarray) -> np.ndarray:
         """Learn from the next frame and return its mask.
@@ -112,11 +115,13 @@ class MotionMask:
         if self.method == "none":
             return np.ones(frame.shape[:2], dtype=bool)
         first, self._before, before = self._before is None, frame, self._before
+        self._n_frames += 1
         if self.method == "difference":
             if first:
                 return np.ones(frame.shape[:2], dtype=bool)
             mask = (cv2.absdiff(frame, before).max(axis=2) > self.threshold).astype(np.uint8)
         else:
+            cv2.setRNGSeed(self._n_frames)
             mask = self._model.apply(frame)
             if first:
                 return np.ones(frame.shape[:2], dtype=bool)
@@ -200,7 +205,8 @@ def hog_windows(frame: np.ndarray, regions, scale: float = 2.0, threshold: float
     Returns
     -------
     ndarray, shape (N, 5)
-        ``x, y, w, h, score``: windows in pixels of the frame, and their distance from the decision boundary.
+        ``x, y, w, h, score``: windows in pixels of the frame, and their distance from the decision boundary, the least
+        first. OpenCV cuts those that reach over the border of a region.
 
     Raises
     ------
@@ -226,7 +232,8 @@ def hog_windows(frame: np.ndarray, regions, scale: float = 2.0, threshold: float
         )
         if len(windows):
             found.append(np.column_stack([windows / scale + [left, top, 0, 0], np.ravel(scores)]))
-    return np.concatenate(found)
+    found = np.concatenate(found)
+    return found[np.lexsort(found.T)]  # OpenCV's threads hand them in in any order
 
 
 def trim(windows, shares=TRIM) -> np.ndarray:

@@ -130,7 +130,7 @@ def annotate(frame: np.ndarray, box, *, lost: bool = False, truth=None, particle
 
 
 TRACK_COLORS = ((0, 94, 213), (178, 114, 0), (115, 158, 0), (0, 159, 230), (167, 121, 204), (233, 180, 86))
-"""Colours of tracks by number, in BGR order: vermilion, blue, green, orange, purple and sky of Okabe and Ito."""
+"""Colours of tracks by number, in BGR order; they are six of Okabe and Ito's."""
 
 
 def annotate_tracks(frame: np.ndarray, tracks, particles: bool = False) -> np.ndarray:

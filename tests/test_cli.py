@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import pftrack
-from pftrack import datasets, metrics, trackers
+from pftrack import datasets, metrics, multi, trackers
 from pftrack.cli import main
 from pftrack.datasets import registry
 
@@ -421,6 +421,66 @@ def test_ctrl_c_leaves_no_file_and_exits_130(film, tmp_path, out):
     assert errors == "pftrack: interrupted; nothing was written\n"
     assert output == ""
     assert list(out.iterdir()) == []
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# pftrack multi
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def found(tmp_path):
+    """Detections of the one target of the film, frames from 1, and where it goes."""
+    path = tmp_path / "det.txt"
+    path.write_text("".join(f"{n + 1},-1,{10 + 2 * n},20,16,30,1,-1,-1,-1\n" for n in range(5)))
+    return path
+
+
+def test_the_mot_file_holds_what_python_computes(film, found, out, capfd):
+    assert run("multi", film, "--detections", found, "--particles", 40, "--seed", 3, "--mot", out / "a.txt") == 0
+    assert capfd.readouterr().out == f"{N_FRAMES} frames, 1 pedestrians\n"
+    tracker = pftrack.BagOfFeaturesParticleFilter(40, seed=3)
+    frames = datasets.open_frames(film)
+    rows = multi.table(multi.follow(tracker, frames, datasets.readers.read_mot(found)))
+    np.testing.assert_allclose(datasets.readers.read_mot(out / "a.txt"), rows, rtol=1e-4)
+    np.testing.assert_array_equal(rows[:, 0], np.arange(4, N_FRAMES))
+    np.testing.assert_allclose(rows[:, 2], 10 + 2 * rows[:, 0], atol=4)
+
+
+def test_the_video_of_many_plays_and_shows_their_boxes(film, found, out):
+    assert run("multi", film, "--detections", found, "--video", out / "a.mp4") == 0
+    facts = video_facts(out / "a.mp4")
+    assert (facts["codec"], facts["pixels"], facts["n_frames"]) == ("h264", "yuv420p", N_FRAMES)
+    before, after = (datasets.open_frames(out / "a.mp4")[t].astype(int) for t in (0, N_FRAMES - 1))
+    plain = [picture(t).astype(int) for t in (0, N_FRAMES - 1)]
+    assert np.abs(after - plain[1]).mean() > 2 * np.abs(before - plain[0]).mean()
+
+
+def test_a_film_without_pedestrians_has_none(film, out, capfd):
+    assert run("multi", film, "--mot", out / "a.txt") == 0
+    assert capfd.readouterr().out == f"{N_FRAMES} frames, 0 pedestrians\n"
+    assert (out / "a.txt").read_text() == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["--tracker", "color-pf"], "choose one of bof-pf"),
+        (["--particles", "0"], "at least 1"),
+        (["--seed", "-1"], "seed"),
+        (["--detections", "no.txt"], "there is no file no.txt"),
+        (["--video", "no/such/folder.mp4"], "no/such"),
+    ],
+)
+def test_a_bad_argument_of_multi_is_one_line_and_leaves_nothing(film, out, capfd, arguments, hint):
+    assert run("multi", film, *arguments, "--mot", out / "a.txt") == 2
+    assert_matches(hint, one_line(capfd))
+    assert list(out.iterdir()) == []
+
+
+def test_a_missing_source_of_multi_is_one_line(capfd):
+    assert run("multi", "nowhere.mp4") == 2
+    assert_matches("no file, folder or dataset 'nowhere.mp4'", one_line(capfd))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

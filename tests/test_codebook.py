@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pftrack import codebook, color, datasets
+from pftrack import codebook, color
 
 
 def one_at_a_time(points, bandwidth):
@@ -25,9 +25,9 @@ def one_at_a_time(points, bandwidth):
 
 
 @pytest.fixture(scope="module")
-def patches():
+def patches(footage):
     """Colour histograms of square patches of a real picture."""
-    frame = datasets.load("bobot-I").frames[0]
+    frame = footage("bobot-I").frames[0]
     rng = np.random.default_rng(0)
     boxes = np.column_stack([rng.uniform(0, 300, 250), rng.uniform(0, 220, 250), np.full((250, 2), 14)])
     return color.histograms(frame, boxes, outside="ignore")

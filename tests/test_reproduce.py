@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import json
 import re
 import socket
@@ -13,10 +14,10 @@ import pandas as pd
 import pytest
 
 import pftrack
-from pftrack import datasets, experiments, masks, metrics, reproduce
+from pftrack import datasets, detection, experiments, masks, metrics, reproduce
 from pftrack.cli import main
 from pftrack.datasets import registry
-from pftrack.reproduce import Plan
+from pftrack.reproduce import Plan, many
 
 SCENE = "synthetic-occlusion"
 N_FRAMES = 70
@@ -433,3 +434,58 @@ def test_the_command_reproduces_on_the_papers_own_footage(footage, monkeypatch, 
     tracker = pftrack.ColorParticleFilter(n_particles=100, seed=0)
     boxes = pftrack.track(tracker, sequence.frames[:50], sequence.boxes[0])
     np.testing.assert_allclose(table["mean"][:50], metrics.overlap(boxes, sequence.boxes[:50]), atol=0.51e-6)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Many pedestrians
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_each_detector_is_scored_over_the_whole_film(plan, monkeypatch):
+    rows = [("plain", {"background": "difference", **many.PLAIN}), ("+ size prior", {"background": "difference"})]
+    monkeypatch.setattr(many, "detectors", lambda: rows)
+    (table,) = made("detection", plan)
+    assert table["detector"].tolist() == ["plain", "+ size prior"]
+    for (_, settings), row in zip(rows, table.to_dict("records"), strict=True):
+        found = detection.detect(scene().frames, detection.PedestrianDetector(**settings))
+        score = metrics.detections(found, scene().tracks)
+        assert row["n_found"] == score.n_found
+        np.testing.assert_allclose([row["recall"], row["precision"]], [score.recall, score.precision], atol=1e-6)
+    assert (table["ms"] > 0).all()
+    assert table["ms"].nunique() == 1  # the windows are the same
+    assert int(table.attrs["boxes"]) == len(scene().tracks)
+
+
+def test_steps_lead_from_the_paper_to_the_default():
+    for steps, first, kind in [
+        (many.bof_steps(), many.LITERAL, pftrack.BagOfFeaturesParticleFilter),
+        (many.detectors()[6:], many.PLAIN, pftrack.PedestrianDetector),
+    ]:
+        assert steps[0][1] == first
+        assert {} in [settings for _, settings in steps]
+        for (_, before), (_, after) in itertools.pairwise(steps[: len(first) + 1]):
+            assert len(before) == len(after) + 1
+            assert after.items() <= before.items()
+        for _, settings in steps:
+            kind(**settings)
+
+
+def test_the_errors_of_the_bag_of_features_filter_are_those_of_its_runs(plan, monkeypatch):
+    plan = dataclasses.replace(plan, n_runs=2)
+    monkeypatch.setattr(many, "bof_steps", lambda: [("all", {}), ("fixed", {"adapt_weights": False})])
+    monkeypatch.setattr(many, "AT_MOST", 40)
+    whole, ablation = made("bof", plan)
+    known = whole[whole["known"]]
+    for seed in (0, 1):
+        tracker = pftrack.BagOfFeaturesParticleFilter(seed=seed)
+        tracker.init(list(scene().frames[:5]), scene().boxes[:5, None])
+        tracks = list(pftrack.multi.follow(tracker, scene().frames[5:]))
+        errors = metrics.center_error([track.box for (track,) in tracks], scene().boxes[5:])
+        row = known[known["seed"] == seed].iloc[0]
+        assert row["center_error"] == pytest.approx(np.nanmean(errors), abs=1e-5)
+        assert row["frames"] == np.isfinite(errors).sum()
+        assert row["swapped"] == 0
+    assert ablation["setting"].tolist() == ["all", "fixed"]
+    assert (ablation["runs"] == 2).all()
+    assert (ablation["swaps"] == 0).all()
+    assert ablation["center_error_mean"].iloc[0] != ablation["center_error_mean"].iloc[1]

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pftrack import color, datasets, metrics, superpixels
+from pftrack import color, metrics, superpixels
 
 
 @pytest.fixture(scope="module")
-def film():
-    sequence = datasets.load("bobot-I")
+def film(footage):
+    sequence = footage("bobot-I")
     return [sequence.frames[t] for t in range(8)], sequence.boxes[:8]
 
 

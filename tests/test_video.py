@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pftrack import datasets, video
+from pftrack.multi import Track
 
 
 def ramp(n_frames=8, size=(48, 64)):
@@ -243,3 +244,24 @@ def test_what_lies_beyond_the_border_is_cut_off(frame, box):
     assert annotated.shape == frame.shape
     if box[0] > 160:
         np.testing.assert_array_equal(annotated, frame)
+
+
+def test_tracks_have_their_own_colours_and_the_held_ones_thin_boxes(frame):
+    boxes = [(20, 40, 30, 50), (90, 40, 30, 50)]
+    tracks = [Track(1, np.array(boxes[0], float), 1.0), Track(2, np.array(boxes[1], float), 1.0, held=True)]
+    annotated = video.annotate_tracks(frame, tracks)
+    assert tuple(annotated[70, 20]) == video.TRACK_COLORS[0]
+    assert tuple(annotated[70, 90]) == video.TRACK_COLORS[1]
+    drawn = changed(frame, annotated)
+    assert drawn[70, :60].sum() > drawn[70, 60:].sum() == 2
+    assert not drawn[100:].any()
+    dots = video.annotate_tracks(
+        frame, [Track(1, tracks[0].box, 1.0, False, np.array([[140.0, 20, 5, 5]]))], particles=True
+    )
+    assert changed(frame, dots)[18:23, 138:143].any()
+
+
+def test_no_tracks_draw_nothing(frame):
+    np.testing.assert_array_equal(video.annotate_tracks(frame, []), frame)
+    beyond = Track(7, np.array([-500.0, -500, 20, 20]), 1.0)
+    np.testing.assert_array_equal(video.annotate_tracks(frame, [beyond]), frame)

@@ -86,10 +86,15 @@ class BagOfFeaturesParticleFilter:
         The state is held when the best log-likelihood of the particles is lower by so much than is usual for this
         target, or less than a quarter of the target is seen. *The paper's threshold is not printed.*
     learn : {"bags", "codebook", "nothing"}
-        What follows the target's looks every fifth frame: the template bags, the codebooks as in section 3.2.3 of the
+        What follows the target's looks: the template bags, the codebooks as in section 3.2.3 of the
         paper (:func:`pftrack.codebook.update_codebook`), or nothing.
     forget : float
         The forget factor, from 0 to 1: share of the old when something new is learnt.
+    update_every : int
+        Frames from one learning to the next. *Not printed.*
+    n_superpixels, n_patches : int
+        About how many superpixels the surroundings of a target have, and how many patches of texture are drawn from
+        the region of its particles; see :func:`pftrack.patches.describe`. *Not printed.*
     detector : PedestrianDetector, optional
         What finds the targets in the training frames; one with the default settings if not given.
 
@@ -130,7 +135,7 @@ class BagOfFeaturesParticleFilter:
         discriminative: bool = True,
         mutual_occlusion: bool = True,
         follow_camera: bool = True,
-        occlusion_drop: float = 8.0,
+        occlusion_drop: float = 6.0,
         learn: str = "bags",
         forget: float = 0.9,
         update_every: int = 5,
@@ -363,8 +368,9 @@ class _Target:
         self.found = self._describe(frame, _region(boxes, frame.shape), self.box[3])
         log_weights, color_weight, best = self.weigh(boxes, nearer)
         weights = smc.normalize(log_weights)
-        drop = 0.0 if self.usual is None else self.usual - best
-        held = self.seen < 0.25 or drop > self.settings.occlusion_drop
+        held = self.seen < 0.25 or self.usual - best > self.settings.occlusion_drop
+        if self.seen > SHARE_SEEN:  # slowly where nothing looks like the target
+            self.usual += (0.02 if held else 0.1) * (best - self.usual)
         moved = self.particles
         if not held:
             x, y, w, h = smc.weighted_mean(moved, weights)
@@ -399,8 +405,6 @@ class _Target:
             self.usual = best
         hidden = self.usual - 1.0  # what is behind somebody is a little less likely than what is seen to match
         log_weights = shares * log_weights + (1 - shares) * hidden
-        if self.seen > SHARE_SEEN:
-            self.usual = 0.9 * self.usual + 0.1 * best
         return log_weights, color_weight, best
 
     def _color_weight(self, ranges) -> float:

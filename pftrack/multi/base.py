@@ -69,7 +69,7 @@ def link(detections: Sequence, min_frames: int, min_overlap: float = 0.3) -> lis
 
     Detections that overlap by half in one frame are first merged: they are one person, found twice. Each frame is then
     joined to the latest boxes of the targets so far, one to one, for the largest sum of overlaps. A target that keeps
-    inside another that was found as often is left out.
+    inside a larger one, found as often at least, is left out.
 
     Parameters
     ----------
@@ -83,7 +83,8 @@ def link(detections: Sequence, min_frames: int, min_overlap: float = 0.3) -> lis
     Returns
     -------
     list of dict of int to ndarray, shape (4,)
-        For each target its box in the frames in which it was found; the target found most often first.
+        For each target its box in the frames in which it was found; the target found most often first, and of those
+        found equally often the largest.
 
     Examples
     --------
@@ -106,7 +107,8 @@ def link(detections: Sequence, min_frames: int, min_overlap: float = 0.3) -> lis
                 targets[target][t] = boxes[box]
                 joined.add(box)
         targets += [{t: box} for n, box in enumerate(boxes) if n not in joined]
-    targets = sorted((target for target in targets if len(target) >= min_frames), key=len, reverse=True)
+    targets = [target for target in targets if len(target) >= min_frames]
+    targets.sort(key=lambda target: (len(target), np.prod(list(target.values())[-1][2:])), reverse=True)
     return [target for n, target in enumerate(targets) if not any(_inside(target, other) for other in targets[:n])]
 
 

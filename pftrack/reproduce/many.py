@@ -99,10 +99,10 @@ def _times(frames, kinds, progress: bool) -> list[float]:
 N_TRAINING = 5
 """Training frames of the bag-of-features filter; the targets that are followed are those seen in all of them."""
 
-AT_MOST = 210
-"""Frames of a sequence of which the ablation uses no more; the crowd of Li et al. 2016 has so many."""
+AT_MOST = 160
+"""Frames of a sequence of which the ablation uses no more; on `bobot-J` they hold the first crossing."""
 
-AFTER = 60
+AFTER = 20
 """Last frames in which it is asked whether two targets have changed their names."""
 
 LITERAL = {
@@ -147,7 +147,7 @@ def bof(plan: Plan) -> list[Path]:
 
     ``bof.csv`` has one row for each sequence, target and seed: once with the targets known in the training frames
     (``known``), and once with those that the detector found. ``bof-ablation.csv`` has one row for each setting and
-    sequence, over the first 210 frames, with the targets known: mean and standard deviation over seeds of the mean
+    sequence, over the first 160 frames, with the targets known: mean and standard deviation over seeds of the mean
     error over targets, and in how many runs two targets changed their names. Errors are in pixels.
     """
     seeds = range(min(plan.n_runs, 10))

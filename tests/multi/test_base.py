@@ -1,0 +1,82 @@
+"""What multi-target trackers share."""
+
+import numpy as np
+import pytest
+
+from pftrack import multi
+from pftrack.multi import Track, link, table
+
+
+def found(*people, score=1.0):
+    return np.array([[x, 20, 20, 60, score] for x in people], dtype=float).reshape(-1, 5)
+
+
+def test_people_who_walk_are_joined_and_a_ghost_is_not():
+    frames = [found(10 + 3 * t, 200 - 3 * t) for t in range(5)]
+    frames[2] = np.vstack([frames[2], found(400)])
+    left, right = sorted(link(frames, min_frames=4), key=lambda target: target[0][0])
+    assert [box[0] for box in left.values()] == [10, 13, 16, 19, 22]
+    assert [box[0] for box in right.values()] == [200, 197, 194, 191, 188]
+
+
+def test_joining_is_for_the_largest_sum():
+    """Taking the best pair first would leave the second person with nobody."""
+    frames = [found(0, 9), found(5, 15)]
+    targets = link(frames, min_frames=2)
+    assert sorted((a[0], b[0]) for a, b in (list(target.values()) for target in targets)) == [(0, 5), (9, 15)]
+
+
+def test_one_person_found_twice_is_one():
+    frames = [np.vstack([found(50, score=2.0), found(53, score=0.5)]) for _ in range(3)]
+    assert len(link(frames, min_frames=2)) == 1
+
+
+def test_legs_inside_a_person_are_not_another():
+    legs = np.array([[52, 50, 14, 30, 3.0]])
+    assert len(link([np.vstack([found(50), legs])] * 3, min_frames=3)) == 1
+    behind = np.array([[60, 25, 18, 50, 3.0]])  # half hidden, which is somebody
+    assert len(link([np.vstack([found(50), behind])] * 3, min_frames=3)) == 2
+
+
+def test_gaps_are_bridged_and_nobody_is_nobody():
+    (target,) = link([found(50), found(), found(52)], min_frames=2)
+    assert list(target) == [0, 2]
+    assert link([found(), found()], min_frames=1) == []
+    assert link([], min_frames=1) == []
+
+
+class Spy:
+    """A tracker that shows what it is given."""
+
+    def __init__(self):
+        self.given = []
+
+    def update(self, frame, detections=None):
+        self.given.append(detections)
+        if frame.ndim != 3:
+            raise ValueError("that is no frame")
+        return [Track(1, np.array([1.0, 2, 3, 4]), 0.5)]
+
+
+def test_each_frame_gets_its_own_detections():
+    rows = np.array([[0, -1, 1, 2, 3, 4, 0.5], [2, -1, 5, 6, 7, 8, 0.25]])
+    tracker = Spy()
+    assert len(list(multi.follow(tracker, [np.zeros((4, 4, 3))] * 3, rows))) == 3
+    assert [found.tolist() for found in tracker.given] == [[[1, 2, 3, 4, 0.5]], [], [[5, 6, 7, 8, 0.25]]]
+    tracker = Spy()
+    list(multi.follow(tracker, [np.zeros((4, 4, 3))]))
+    assert tracker.given == [None]
+
+
+def test_an_error_says_in_which_frame():
+    with pytest.raises(ValueError, match="frame 1: that is no frame"):
+        list(multi.follow(Spy(), [np.zeros((4, 4, 3)), np.zeros(4)]))
+    with pytest.raises(ValueError, match="no frames"):
+        list(multi.follow(Spy(), []))
+
+
+def test_a_table_has_a_row_for_every_track():
+    rows = table([[Track(3, np.arange(4.0), 0.25)], [], [Track(1, np.ones(4), 1.0), Track(3, np.ones(4), 0.5)]])
+    np.testing.assert_array_equal(rows[:, :2], [[0, 3], [2, 1], [2, 3]])
+    np.testing.assert_array_equal(rows[0, 2:], [0, 1, 2, 3, 0.25])
+    assert table([]).shape == (0, 7)
