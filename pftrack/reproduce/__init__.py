@@ -1,12 +1,14 @@
 """The full-size experiments behind the book: the figures and tables of the three papers, and more.
 
-Each item of :data:`ITEMS` takes a :class:`Plan` and writes one or two files below ``results/``; ``pftrack reproduce``
-runs them. The files are plain CSV under lines ``# key: value`` that say the settings, versions and machine;
-:func:`read` gives both. What has been computed is kept in the user's cache, so an interrupted item goes on where it
-stopped, and items share their runs. Chapter 6 shows the files and re-runs a part of them.
+Each item of :data:`ITEMS` takes a :class:`~pftrack.reproduce.plan.Plan` and writes one or two files below
+``results/``; ``pftrack reproduce`` runs them. The files are plain CSV under lines ``# key: value`` that say the
+settings, versions and machine; :func:`~pftrack.reproduce.plan.read` gives both. What has been computed is kept in the
+user's cache, so an interrupted item goes on where it stopped, and items share their runs. Chapters 6 to 10 show the
+files and re-run a part of them.
 
-Overlaps and hits are given twice, over ``all`` frames, a hidden one counting as overlap 0 and as a miss, and over the
-``visible`` ones (see :mod:`pftrack.metrics`). And "± sd" can mean three things, of which the paper names none:
+In the items of one pedestrian (:mod:`pftrack.reproduce.one`) overlaps and hits are given twice, over ``all`` frames, a
+hidden one counting as overlap 0 and as a miss, and over the ``visible`` ones (see :mod:`pftrack.metrics`). And "± sd"
+can mean three things, of which the paper names none:
 
 runs
     standard deviation, over runs (or masks), of a run's mean over frames: how much one run differs from the next;
