@@ -115,11 +115,11 @@ LITERAL = {
 """Settings that make the bag-of-features filter that of the paper, as far as its text tells."""
 
 ADDITIONS = (
+    ("learning bags", "learn"),
     ("bands", "n_bands"),
     ("worth of words", "discriminative"),
     ("mutual occlusion", "mutual_occlusion"),
     ("camera", "follow_camera"),
-    ("learning bags", "learn"),
 )
 """What we added to the paper's filter, in this order, and the setting that each step returns to its default."""
 
@@ -130,7 +130,7 @@ def bof_steps() -> list[tuple[str, dict[str, object]]]:
     Examples
     --------
     >>> [name for name, _ in bof_steps()][:3]
-    ['the paper', '+ bands', '+ worth of words']
+    ['the paper', '+ learning bags', '+ bands']
     """
     left_out = dict(LITERAL)
     rows = [("the paper", dict(left_out))]
