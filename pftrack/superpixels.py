@@ -106,7 +106,7 @@ def segment(picture: np.ndarray, n_segments: int = 200, compactness: float = 10.
     n_segments = max(min(n_segments, picture.shape[0] * picture.shape[1] // 9), 1)
     rgb = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_BGR2RGB)
     labels = slic(rgb, n_segments=n_segments, compactness=compactness, max_num_iter=n_steps, start_label=0)
-    return np.unique(labels, return_inverse=True)[1].reshape(labels.shape)
+    return (np.cumsum(np.bincount(labels.ravel()) > 0) - 1)[labels]  # without gaps
 
 
 def histograms(bins: np.ndarray, labels: np.ndarray) -> np.ndarray:

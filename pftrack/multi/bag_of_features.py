@@ -341,17 +341,18 @@ class _Target:
 
     def _bags(self, found, boxes, nearer=None) -> tuple[list[np.ndarray], np.ndarray]:
         """Return the bags of every band of many boxes for each feature, and how much of each band is seen."""
-        bags = []
+        bags, n_bands = [], self.settings.n_bands
         for feature, of_one in enumerate(found):
-            covered = patches.coverage(boxes, of_one.edges, self.settings.n_bands)
             visible = of_one.areas
             if nearer is not None and len(nearer):
                 visible = visible * np.prod(1 - patches.coverage(nearer, of_one.edges)[:, 0], axis=0)
-            total = covered @ visible
+            summed = np.column_stack([visible[:, None] * self._which(of_one, feature), visible, of_one.areas])
+            covered = patches.coverage(boxes, of_one.edges, n_bands).reshape(len(boxes) * n_bands, len(of_one))
+            sums = (covered @ summed).reshape(len(boxes), n_bands, -1)  # all bands of all boxes in one product
+            total = sums[..., -2]
             if feature == 0:
-                seen = total / np.maximum(covered @ of_one.areas, 1e-9)
-            bag = covered @ (visible[:, None] * self._which(of_one, feature))
-            bags.append(bag / np.maximum(total, 1e-9)[..., None])
+                seen = total / np.maximum(sums[..., -1], 1e-9)
+            bags.append(sums[..., :-2] / np.maximum(total, 1e-9)[..., None])
         return bags, seen
 
     def _similarity(self, bags, seen, feature: int) -> np.ndarray:
