@@ -112,7 +112,8 @@ LITERAL = {
     "follow_camera": False,
     "learn": "codebook",
 }
-"""Settings that make the bag-of-features filter that of the paper, as far as its text tells."""
+"""Settings that make the bag-of-features filter that of the paper, as far as its text tells; what remains is that the
+candidates share a segmentation, and that a patch may be like no word."""
 
 ADDITIONS = (
     ("learning bags", "learn"),
