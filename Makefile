@@ -28,6 +28,7 @@ lab: $(VENV)/ready
 bench: benchmarks/.venv/ready
 	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/speed.py $(ARGS)
 	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/clustering.py
+	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/association.py
 
 clean:
 	rm -rf _build $(VENV) benchmarks/.venv *.egg-info .pytest_cache .ruff_cache .coverage
@@ -41,5 +42,5 @@ $(VENV)/ready: requirements.txt pyproject.toml
 
 benchmarks/.venv/ready: benchmarks/requirements.txt
 	$(PYTHON) -m venv benchmarks/.venv
-	benchmarks/.venv/bin/pip install --quiet --disable-pip-version-check -r $<
+	benchmarks/.venv/bin/pip install --quiet --disable-pip-version-check --no-deps -r $<
 	@touch $@

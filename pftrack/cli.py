@@ -13,6 +13,7 @@ import itertools
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import BrokenExecutor
@@ -125,8 +126,10 @@ def _parser() -> argparse.ArgumentParser:
     many.set_defaults(run=_multi)
 
     evaluate = commands.add_parser("evaluate", help="score a result against the truth")
-    evaluate.add_argument("result", type=Path, metavar="RESULT", help="a CSV written by pftrack track")
-    evaluate.add_argument("truth", metavar="TRUTH", help="a dataset id, or a CSV of the same form")
+    result = "what pftrack track --csv or pftrack multi --mot wrote"
+    truth = "a dataset id, or a file of the same form; for many targets also the XML of CAVIAR and PETS"
+    evaluate.add_argument("result", type=Path, metavar="RESULT", help=result)
+    evaluate.add_argument("truth", metavar="TRUTH", help=truth)
     evaluate.add_argument("--json", action="store_true", help="print JSON instead of a table")
     evaluate.set_defaults(run=_evaluate)
 
@@ -332,16 +335,57 @@ def _multi(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    boxes = read_csv(options.result)
-    truth = _load(options.truth).boxes if options.truth in datasets.ids() else read_csv(Path(options.truth))
-    if len(boxes) != len(truth):
-        raise ValueError(f"{options.result} has {len(boxes)} frames but {options.truth} has {len(truth)}")
-    score = metrics.single_target(boxes, truth).as_dict()
+    score = _score_many if _is_of_many(options.result, Path(options.truth)) else _score_one
+    values = score(options.result, options.truth).as_dict()
     if options.json:
-        print(json.dumps({name: None if math.isnan(value) else value for name, value in score.items()}, indent=2))
+        print(json.dumps({name: None if math.isnan(value) else value for name, value in values.items()}, indent=2))
         return
-    for name, value in score.items():
+    for name, value in values.items():
         print(f"{name:<20}{value:>10.3f}" if isinstance(value, float) else f"{name:<20}{value:>10}")
+
+
+def _is_of_many(*paths: Path) -> bool:
+    """Tell rows of the MOTChallenge, seven numbers or more, from the CSV of one target, which has a header.
+
+    The first file decides that has a line; ``pftrack multi --mot`` writes none when nobody was found.
+    """
+    for path in paths:
+        if not path.is_file():
+            continue
+        with path.open(encoding="utf-8", errors="replace") as file:
+            line = next((line for line in file if line.strip()), "").strip()
+        if line:
+            return line.startswith("<") or bool(re.match(r"([-+.\de]+\s*,\s*){6}", line))
+    return True
+
+
+def _score_one(result: Path, truth: str) -> metrics.SingleTargetScore:
+    boxes = read_csv(result)
+    expected = _load(truth).boxes if truth in datasets.ids() else read_csv(Path(truth))
+    if len(boxes) != len(expected):
+        raise ValueError(f"{result} has {len(boxes)} frames but {truth} has {len(expected)}")
+    return metrics.single_target(boxes, expected)
+
+
+def _score_many(result: Path, truth: str) -> metrics.MultiTargetScore:
+    """Score tracks; of a file that is the truth, rows whose seventh number is 0 do not count, by the MOTChallenge."""
+    tracks = _read_tracks(result)
+    if truth not in datasets.ids():
+        expected = _read_tracks(Path(truth))
+        return metrics.multi_target(tracks, expected[expected[:, 6] != 0])
+    sequence = _load(truth)
+    if len(tracks) and tracks[-1, 0] >= len(sequence):
+        raise ValueError(f"{result} goes on to frame {tracks[-1, 0] + 1:g} but {truth} has {len(sequence)}")
+    return metrics.multi_target(tracks, sequence.tracks)
+
+
+def _read_tracks(path: Path) -> np.ndarray:
+    if path.suffix.lower() == ".xml":
+        return readers.read_xml(path)
+    tracks = readers.read_mot(path)
+    if len(tracks) and tracks[0, 0] < 0:
+        raise ValueError(f"{path} has a frame {tracks[0, 0] + 1:g}, but in MOTChallenge files frames count from 1")
+    return tracks
 
 
 def _data(options: argparse.Namespace) -> None:

@@ -395,8 +395,8 @@ def table(runs: Iterable[Run], boxes: Iterable[np.ndarray]) -> pd.DataFrame:
     -------
     pandas.DataFrame
         The columns tracker, sequence, target and seed; every setting of the constructor, those left at their default
-        included; and the fields of :class:`pftrack.metrics.SingleTargetScore`. Where trackers of several kinds are
-        in one table, the settings that one of them has not are missing in its rows.
+        included; and the fields of :class:`~pftrack.metrics.single.SingleTargetScore`. Where trackers of several kinds
+        are in one table, the settings that one of them has not are missing in its rows.
 
     Raises
     ------

@@ -319,7 +319,7 @@ def _merge(film, masks) -> tuple[np.ndarray, np.ndarray]:
 def _folder(store, film, masks, n_best) -> Path:
     """Make the folder for the blocks of exactly this search by exactly this code."""
     digest = hashlib.blake2b(digest_size=16)
-    for source in (__file__, color.__file__, metrics.__file__):
+    for source in (__file__, color.__file__, metrics.single.__file__):
         digest.update(Path(source).read_bytes())
     digest.update(repr((cv2.__version__, film.codes.shape, film.is_camshift, n_best)).encode())
     for array in (film.codes, film.truth, masks):

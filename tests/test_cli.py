@@ -21,7 +21,7 @@ import pytest
 import pftrack
 from pftrack import datasets, metrics, multi, trackers
 from pftrack.cli import main
-from pftrack.datasets import registry
+from pftrack.datasets import readers, registry
 
 N_FRAMES = 12
 BOX = (10, 20, 16, 30)
@@ -600,6 +600,102 @@ def test_a_truth_that_is_always_hidden_is_one_line(tmp_path, capfd):
     boxes = write_boxes(tmp_path / "boxes.csv", [[0, 0, 10, 10]] * 2)
     assert run("evaluate", boxes, hidden) == 2
     assert_matches("hidden in every frame", one_line(capfd))
+
+
+def write_rows(path: Path, tracks) -> Path:
+    readers.write_mot(path, tracks)
+    return path
+
+
+@pytest.fixture
+def crowd(tmp_path):
+    """Tracks of a tracker, with two swapped half-way and boxes that are a little off, and the truth."""
+    truth = datasets.load("synthetic-crowd").tracks
+    tracks = truth + np.random.default_rng(1).integers(-2, 3, truth.shape) * [0, 0, 1, 1, 0, 0, 0]
+    late = tracks[:, 0] >= 50
+    tracks[late, 1] = np.array([0, 2, 1, 3, 4, 5])[tracks[late, 1].astype(int)]
+    return tracks, truth, write_rows(tmp_path / "tracks.txt", tracks)
+
+
+@pytest.mark.parametrize("kind", ["dataset", "rows"])
+def test_tracks_of_many_are_scored(crowd, tmp_path, capfd, kind):
+    tracks, truth, result = crowd
+    expected = metrics.multi_target(tracks, truth).as_dict()
+    assert expected["mota"] > expected["idf1"] > 0.5
+    reference = "synthetic-crowd" if kind == "dataset" else write_rows(tmp_path / "truth.csv", truth)
+    assert run("evaluate", result, reference, "--json") == 0
+    assert json.loads(capfd.readouterr().out) == pytest.approx(expected)
+    assert run("evaluate", result, reference) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert len({len(line) for line in lines}) == 1
+    table = dict(line.split() for line in lines)
+    assert list(table) == list(expected)
+    for name, value in expected.items():
+        assert float(table[name]) == pytest.approx(value, abs=0.00051)
+
+
+def test_the_truth_may_be_xml(tmp_path, capfd):
+    boxes = "".join(
+        f'<frame number="{t}"><objectlist><object id="8"><box xc="{20 + t}" yc="30" w="10" h="20"/></object>'
+        "</objectlist></frame>"
+        for t in range(4)
+    )
+    (tmp_path / "truth.xml").write_text(f"<dataset>{boxes}</dataset>")
+    result = write_rows(tmp_path / "tracks.txt", [[t, 1, 15 + t, 20, 10, 20, 1] for t in range(3)])
+    assert run("evaluate", result, tmp_path / "truth.xml", "--json") == 0
+    score = json.loads(capfd.readouterr().out)
+    assert (score["n_matched"], score["misses"], score["motp"]) == (3, 1, 1)
+
+
+def test_true_boxes_that_are_flagged_do_not_count(tmp_path, capfd):
+    truth = [[t, id, 50 * id, 20, 10, 20, id != 2] for t in range(3) for id in (1, 2)]
+    result = write_rows(tmp_path / "tracks.txt", [[t, 1, 50, 20, 10, 20, 0] for t in range(3)])
+    assert run("evaluate", result, write_rows(tmp_path / "truth.txt", truth), "--json") == 0
+    score = json.loads(capfd.readouterr().out)
+    assert (score["n_truth"], score["n_found"], score["mota"]) == (3, 3, 1)
+
+
+@pytest.mark.parametrize("kind", ["dataset", "rows"])
+def test_a_result_without_anybody_is_scored(crowd, tmp_path, capfd, kind):
+    reference = "synthetic-crowd" if kind == "dataset" else crowd[2]
+    assert run("evaluate", write_rows(tmp_path / "none.txt", np.empty((0, 7))), reference, "--json") == 0
+    score = json.loads(capfd.readouterr().out)
+    assert (score["misses"], score["mota"], score["motp"]) == (len(crowd[1]), 0, None)
+
+
+def test_what_multi_writes_evaluate_reads(film, found, out, capfd):
+    assert run("multi", film, "--detections", found, "--mot", out / "tracks.txt") == 0
+    capfd.readouterr()
+    truth = [[t, 4, 10 + 2 * t, 20, 16, 30, 1] for t in range(N_FRAMES)]
+    assert run("evaluate", out / "tracks.txt", write_rows(out / "truth.txt", truth), "--json") == 0
+    expected = metrics.multi_target(readers.read_mot(out / "tracks.txt"), truth)
+    assert json.loads(capfd.readouterr().out) == pytest.approx(expected.as_dict())
+    assert expected.n_matched == N_FRAMES - 4  # it learns for four frames
+
+
+BAD_ROWS = {
+    "a short line": ("1,1,2,3,4,5,1\n2,1,2,3\n", "tracks.txt, line 2: expected"),
+    "an id twice": ("1,1,2,3,4,5,1\n1,1,9,9,4,5,1\n", "id 1 twice in frame 0"),
+    "frames from 0": ("0,1,2,3,4,5,1\n", "tracks.txt has a frame 0, .* from 1"),
+    "half a frame": ("1.5,1,2,3,4,5,1\n", "no whole number"),
+    "a negative side": ("1,1,2,3,-4,5,1\n", "negative side"),
+    "beyond the film": ("101,1,2,3,4,5,1\n", "tracks.txt goes on to frame 101 but synthetic-crowd has 100"),
+}
+
+
+@pytest.mark.parametrize(("content", "hint"), BAD_ROWS.values(), ids=BAD_ROWS.keys())
+def test_bad_tracks_are_one_line(tmp_path, capfd, content, hint):
+    (tmp_path / "tracks.txt").write_text(content)
+    assert run("evaluate", tmp_path / "tracks.txt", "synthetic-crowd") == 2
+    assert_matches(hint, one_line(capfd))
+
+
+def test_results_of_one_and_truth_of_many_do_not_mix(crowd, tmp_path, capfd):
+    one = write_boxes(tmp_path / "boxes.csv", [[0, 0, 10, 10]] * 3)
+    assert run("evaluate", one, crowd[2]) == 2
+    assert_matches("tracks.txt is not a CSV with the columns frame,x,y,w,h", one_line(capfd))
+    assert run("evaluate", crowd[2], one) == 2
+    assert_matches("boxes.csv, line 1: expected 'frame,id,x,y,w,h,score'", one_line(capfd))
 
 
 # ---------------------------------------------------------------------------------------------------------------------

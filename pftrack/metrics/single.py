@@ -1,4 +1,4 @@
-r"""How good a track is: overlap, hits and centre errors.
+"""How good the track of one target is: overlap, hits and centre errors.
 
 The measure of Owczarek et al. 2015 (section IV-A) is the *overlap rate* of the tracker's rectangle and the truth's,
 the area of their intersection divided by that of their union. A frame is a *hit* when the overlap is at least 1/3.
@@ -190,103 +190,6 @@ def single_target(boxes, truth) -> SingleTargetScore:
         center_error_mean=float(errors.mean()) if errors.size else float("nan"),
         center_error_rms=float(np.sqrt(np.mean(errors**2))) if errors.size else float("nan"),
     )
-
-
-@dataclass(frozen=True)
-class DetectionScore:
-    """How good detections are, from :func:`detections`.
-
-    Attributes
-    ----------
-    n_truth, n_found, n_matched : int
-        Number of true boxes, of detections, and of pairs of both that overlap enough.
-    recall, precision : float
-        Share of the true boxes that were found, and of the detections that are right; NaN of nothing.
-    overlap : float
-        Mean overlap of the pairs.
-    """
-
-    n_truth: int
-    n_found: int
-    n_matched: int
-    recall: float
-    precision: float
-    overlap: float
-
-
-def detections(found, truth, min_overlap: float = 0.5) -> DetectionScore:
-    """Score detections against the truth.
-
-    Parameters
-    ----------
-    found, truth : array_like, shape (R, 7)
-        Tables of detections and of tracks, ``frame, id, x, y, w, h, score``; ids and scores are not looked at.
-    min_overlap : float
-        Least overlap of a pair, above 0. In every frame pairs are one to one, and chosen for the largest sum of
-        overlaps.
-
-    Returns
-    -------
-    DetectionScore
-        Recall, precision and mean overlap.
-
-    Examples
-    --------
-    >>> truth = [[0, 1, 0, 0, 10, 20, 1], [1, 1, 0, 0, 10, 20, 1]]
-    >>> score = detections([[0, -1, 0, 0, 10, 16, 0.7]], truth)
-    >>> score.recall, score.precision, score.overlap
-    (0.5, 1.0, 0.8)
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    found, truth = (np.asarray(table, dtype=float).reshape(-1, 7) for table in (found, truth))
-    overlaps = []
-    for t in np.intersect1d(found[:, 0], truth[:, 0]):
-        rates = pairwise_overlap(found[found[:, 0] == t, 2:6], truth[truth[:, 0] == t, 2:6])
-        rates[rates < min_overlap] = 0.0
-        paired = rates[linear_sum_assignment(rates, maximize=True)]
-        overlaps.extend(paired[paired > 0].tolist())
-    n = len(overlaps)
-    return DetectionScore(
-        n_truth=len(truth),
-        n_found=len(found),
-        n_matched=n,
-        recall=n / len(truth) if len(truth) else np.nan,
-        precision=n / len(found) if len(found) else np.nan,
-        overlap=float(np.mean(overlaps)) if n else np.nan,
-    )
-
-
-def match_targets(tracks, truth, frame: int, min_overlap: float = 0.3) -> dict[int, int]:
-    """Tell which track is which target, by their overlap in one frame.
-
-    Parameters
-    ----------
-    tracks, truth : array_like, shape (R, 7)
-        Tables of tracks, ``frame, id, x, y, w, h, score``.
-    frame : int
-        The frame in which they are compared.
-    min_overlap : float
-        Least overlap of a pair.
-
-    Returns
-    -------
-    dict of int to int
-        Number of the track of each target that has one; one to one, for the largest sum of overlaps.
-
-    Examples
-    --------
-    >>> truth = [[0, 7, 0, 0, 10, 20, 1], [0, 8, 50, 0, 10, 20, 1]]
-    >>> match_targets([[0, 1, 51, 0, 10, 20, 1]], truth, frame=0)
-    {8: 1}
-    """
-    from scipy.optimize import linear_sum_assignment
-
-    tracks, truth = (np.asarray(table, dtype=float).reshape(-1, 7) for table in (tracks, truth))
-    tracks, truth = tracks[tracks[:, 0] == frame], truth[truth[:, 0] == frame]
-    rates = pairwise_overlap(truth[:, 2:6], tracks[:, 2:6])
-    pairs = zip(*linear_sum_assignment(rates, maximize=True), strict=True)
-    return {int(truth[i, 1]): int(tracks[j, 1]) for i, j in pairs if rates[i, j] >= min_overlap}
 
 
 def _check_pair(boxes, truth) -> tuple[np.ndarray, np.ndarray]:

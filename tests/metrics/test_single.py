@@ -166,11 +166,6 @@ def test_a_truth_that_is_always_hidden_cannot_be_scored():
         metrics.single_target([[0, 0, 4, 4]] * 2, [HIDDEN] * 2)
 
 
-# ---------------------------------------------------------------------------------------------------------------------
-# Detections, and which track is whom
-# ---------------------------------------------------------------------------------------------------------------------
-
-
 def test_every_pair_overlaps_as_frame_by_frame():
     rng = np.random.default_rng(0)
     a, b = (np.column_stack([rng.uniform(0, 30, (n, 2)), rng.uniform(0, 20, (n, 2))]) for n in (6, 9))
@@ -181,35 +176,3 @@ def test_every_pair_overlaps_as_frame_by_frame():
     assert metrics.pairwise_overlap([[0, 0, 0, 0]], [[0, 0, 0, 0]]) == 0
     with pytest.raises(ValueError, match=r"\(N, 4\) and \(M, 4\)"):
         metrics.pairwise_overlap([0, 0, 1, 1], b)
-
-
-def row(frame, id, x, y=0, w=10, h=20):
-    return [frame, id, x, y, w, h, 1]
-
-
-def test_detections_pair_one_to_one():
-    truth = [row(0, 1, 0), row(0, 2, 100), row(1, 1, 0), row(3, 1, 0)]
-    found = [row(0, -1, 0), row(0, -1, 1), row(0, -1, 50), row(1, -1, 4), row(2, -1, 0)]
-    score = metrics.detections(found, truth)
-    assert (score.n_truth, score.n_found, score.n_matched) == (4, 5, 1)  # 4 of 10 pixels beside overlap by 3/7
-    assert (score.recall, score.precision, score.overlap) == (0.25, 0.2, 1.0)
-    assert metrics.detections(found, truth, min_overlap=0.4).n_matched == 2
-
-
-def test_detections_pair_for_the_largest_sum():
-    truth, found = [row(0, 1, 0), row(0, 2, 6)], [row(0, -1, 3), row(0, -1, -3)]
-    assert metrics.detections(found, truth, min_overlap=0.5).n_matched == 2
-
-
-def test_of_nothing_there_is_no_share():
-    score = metrics.detections(np.empty((0, 7)), [row(0, 1, 0)])
-    assert (score.recall, score.n_matched) == (0, 0)
-    assert np.isnan([score.precision, score.overlap]).all()
-    assert np.isnan(metrics.detections([row(0, -1, 0)], []).recall)
-
-
-def test_tracks_are_matched_in_one_frame():
-    truth = [row(5, 11, 0), row(5, 12, 8), row(5, 13, 200), row(6, 11, 300)]
-    tracks = [row(5, 1, 7), row(5, 2, 1), row(5, 3, 300), row(6, 4, 300)]
-    assert metrics.match_targets(tracks, truth, frame=5) == {11: 2, 12: 1}
-    assert metrics.match_targets(tracks, truth, frame=7) == {}
