@@ -12,13 +12,14 @@ The library behind the book. A tracker is started on the first frame and updated
 
 from pftrack import color, datasets, detection, metrics, motion, multi, smc
 from pftrack.detection import PedestrianDetector
-from pftrack.multi import BagOfFeaturesParticleFilter, Track
+from pftrack.multi import BagOfFeaturesParticleFilter, BoostedParticleFilter, Track
 from pftrack.trackers import (
     CamShiftTracker,
     ColorParticleFilter,
     Estimate,
     MeanShiftTracker,
     RobustParticleFilter,
+    SuperpixelTracker,
     follow,
     track,
 )
@@ -27,12 +28,14 @@ __version__ = "0.1.0"
 
 __all__ = [
     "BagOfFeaturesParticleFilter",
+    "BoostedParticleFilter",
     "CamShiftTracker",
     "ColorParticleFilter",
     "Estimate",
     "MeanShiftTracker",
     "PedestrianDetector",
     "RobustParticleFilter",
+    "SuperpixelTracker",
     "Track",
     "color",
     "datasets",

@@ -27,7 +27,7 @@ FACTOR = 1.5
 """Sides of the surroundings, relative to those of the box."""
 
 
-def surroundings(box, shape, factor: float = FACTOR) -> tuple[int, int, int, int]:
+def surroundings(box, shape, factor: float = FACTOR, square: bool = False) -> tuple[int, int, int, int]:
     """Part of a frame around a box (Li et al. 2016, the region R2).
 
     Parameters
@@ -38,6 +38,8 @@ def surroundings(box, shape, factor: float = FACTOR) -> tuple[int, int, int, int
         Shape of the frame, ``(H, W, ...)``.
     factor : float
         Its sides relative to those of the box, at least 1.
+    square : bool
+        Whether to take a square, its side relative to the diagonal of the box, as Wang et al. (2011) do.
 
     Returns
     -------
@@ -53,12 +55,15 @@ def surroundings(box, shape, factor: float = FACTOR) -> tuple[int, int, int, int
     --------
     >>> surroundings((40, 20, 20, 40), shape=(100, 100, 3))
     (35, 10, 65, 70)
+    >>> surroundings((40, 35, 30, 40), shape=(100, 100, 3), square=True)  # the diagonal is 50
+    (18, 18, 93, 93)
     """
     if not factor >= 1:
         raise ValueError(f"factor must be at least 1, got {factor}")
     x, y, w, h = np.asarray(box, dtype=float)
-    wider, higher = (factor - 1) * w / 2, (factor - 1) * h / 2
-    ((left, top, right, bottom),) = color.pixel_edges([[x - wider, y - higher, factor * w, factor * h]]).tolist()
+    width, height = (factor * np.hypot(w, h),) * 2 if square else (factor * w, factor * h)
+    corner = x - (width - w) / 2, y - (height - h) / 2
+    ((left, top, right, bottom),) = color.pixel_edges([[*corner, width, height]]).tolist()
     left, top, right, bottom = max(left, 0), max(top, 0), min(right, shape[1]), min(bottom, shape[0])
     if right - left < 2 or bottom - top < 2:
         raise ValueError(f"the surroundings of the box {list(box)} show less than 2x2 pixels of the frame")
@@ -143,6 +148,117 @@ def histograms(bins: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class Superpixels:
+    """A part of a frame, cut into superpixels.
+
+    Attributes
+    ----------
+    origin : tuple of int
+        Its first pixel in the frame, ``(x, y)``.
+    labels : ndarray, shape (H, W), int
+        Superpixel of every pixel, from :func:`segment`.
+    features : ndarray, shape (S, 256)
+        Colours of the superpixels, from :func:`histograms`.
+    """
+
+    origin: tuple[int, int]
+    labels: np.ndarray
+    features: np.ndarray
+
+
+def cut(frame: np.ndarray, region, n_segments: int = 200, compactness: float = 10.0, n_steps: int = 10) -> Superpixels:
+    """Cut a part of a frame into superpixels and describe their colours.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (H, W, 3), uint8
+        A colour image in BGR order.
+    region : tuple of int
+        ``(left, top, right, bottom)`` of the part, from :func:`surroundings`.
+    n_segments, compactness, n_steps
+        As for :func:`segment`.
+
+    Returns
+    -------
+    Superpixels
+        Labels and histograms.
+
+    Raises
+    ------
+    ValueError
+        As :func:`segment`.
+
+    Examples
+    --------
+    >>> frame = np.full((60, 80, 3), (0, 160, 0), dtype=np.uint8)
+    >>> found = cut(frame, (20, 10, 50, 40), n_segments=9)
+    >>> found.origin, found.labels.shape, found.features.shape
+    ((20, 10), (30, 30), (9, 256))
+    """
+    left, top, right, bottom = region
+    part = frame[top:bottom, left:right]
+    labels = segment(part, n_segments, compactness, n_steps)
+    return Superpixels((left, top), labels, histograms(color.hsv_bins(part), labels))
+
+
+def areas(found: Superpixels, box) -> np.ndarray:
+    """How many pixels of each superpixel lie inside a box, and how many outside.
+
+    Parameters
+    ----------
+    found : Superpixels
+        From :func:`cut`.
+    box : array_like, shape (4,)
+        ``(x, y, w, h)`` in pixels of the frame.
+
+    Returns
+    -------
+    ndarray of int, shape (2, S)
+        Pixels inside and outside.
+
+    Examples
+    --------
+    >>> halves = Superpixels((10, 0), np.repeat([[0, 1]], 4, axis=0), np.eye(2))
+    >>> areas(halves, [11, 1, 5, 2])
+    array([[0, 2],
+           [4, 2]])
+    """
+    ((x0, y0, x1, y1),) = np.maximum(color.pixel_edges([box]) - [*found.origin, *found.origin], 0).tolist()
+    inside = np.bincount(found.labels[y0:y1, x0:x1].ravel(), minlength=len(found.features))
+    return np.array([inside, np.bincount(found.labels.ravel()) - inside])
+
+
+def paint(found: Superpixels, values, shape) -> np.ndarray:
+    """Paint a value over the pixels of each superpixel.
+
+    Parameters
+    ----------
+    found : Superpixels
+        From :func:`cut`.
+    values : array_like, shape (S,)
+        One for each superpixel, such as its confidence.
+    shape : tuple of int
+        Shape of the frame, ``(H, W, ...)``.
+
+    Returns
+    -------
+    ndarray, shape (H, W)
+        The values, and -1, background, where the frame was not cut.
+
+    Examples
+    --------
+    >>> halves = Superpixels((1, 0), np.array([[0, 1]]), np.eye(2))
+    >>> paint(halves, [0.5, 1.0], shape=(2, 4, 3))
+    array([[-1. ,  0.5,  1. , -1. ],
+           [-1. , -1. , -1. , -1. ]])
+    """
+    (left, top), (height, width) = found.origin, found.labels.shape
+    painted = np.full(shape[:2], -1.0)
+    painted[top : top + height, left : left + width] = np.asarray(values)[found.labels]
+    return painted
+
+
+@dataclass(frozen=True)
 class PriorKnowledge:
     """What the first frames taught about target and background.
 
@@ -197,30 +313,54 @@ def learn(frames, boxes, bandwidth: float = 0.18, n_segments: int = 200, compact
         raise ValueError(
             f"need at least one frame and one box for each, got {len(frames)} frames and boxes {boxes.shape}"
         )
-    features, inside, outside = [], [], []
-    for frame, box in zip(frames, boxes, strict=True):
-        left, top, right, bottom = surroundings(box, frame.shape)
-        part = frame[top:bottom, left:right]
-        labels = segment(part, n_segments, compactness)
-        features.append(histograms(color.hsv_bins(part), labels))
-        ((x0, y0, x1, y1),) = np.maximum(color.pixel_edges([box]) - [left, top, left, top], 0).tolist()
-        of_target = np.bincount(labels[y0:y1, x0:x1].ravel(), minlength=len(features[-1]))
-        inside.append(of_target)
-        outside.append(np.bincount(labels.ravel()) - of_target)
-    features, inside, outside = (np.concatenate(parts) for parts in (features, inside, outside))
+    found = [
+        cut(frame, surroundings(box, frame.shape), n_segments, compactness)
+        for frame, box in zip(frames, boxes, strict=True)
+    ]
+    of_boxes = [areas(of_one, box) for of_one, box in zip(found, boxes, strict=True)]
+    return cluster(np.concatenate([of_one.features for of_one in found]), np.concatenate(of_boxes, axis=1), bandwidth)
+
+
+def cluster(features, areas, bandwidth: float = 0.18) -> PriorKnowledge:
+    """Cluster superpixels and say of each cluster how much it is the target's (Li et al. 2016, eq. 1).
+
+    Parameters
+    ----------
+    features : array_like, shape (S, 256)
+        Of all superpixels of all frames to learn from.
+    areas : array_like, shape (2, S)
+        Pixels of each inside and outside the target's box, from :func:`areas`; no superpixel is empty.
+    bandwidth : float
+        As for :func:`learn`.
+
+    Returns
+    -------
+    PriorKnowledge
+        Clusters and their confidences.
+
+    Raises
+    ------
+    ValueError
+        As :func:`pftrack.codebook.mean_shift`.
+
+    Examples
+    --------
+    >>> cluster([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]], areas=[[30, 10, 0], [0, 10, 20]]).confidences
+    array([ 0.6, -1. ])
+    """
+    features, (inside, outside) = np.asarray(features, dtype=float), np.asarray(areas)
     centers = codebook.mean_shift(features, bandwidth)
-    cluster = codebook.nearest_words(features, centers)
-    occupied, cluster = np.unique(cluster, return_inverse=True)  # a mode may be the nearest to none
+    member_of = codebook.nearest_words(features, centers)
+    occupied, member_of = np.unique(member_of, return_inverse=True)  # a mode may be the nearest to none
     centers = centers[occupied]
-    distances = np.linalg.norm(features - centers[cluster], axis=1)
     radii = np.zeros(len(centers))
-    np.maximum.at(radii, cluster, distances)
+    np.maximum.at(radii, member_of, np.linalg.norm(features - centers[member_of], axis=1))
     radii[radii < 1e-9] = bandwidth
-    target, background = np.bincount(cluster, inside), np.bincount(cluster, outside)
+    target, background = np.bincount(member_of, inside), np.bincount(member_of, outside)
     return PriorKnowledge(centers, radii, (target - background) / (target + background))
 
 
-def confidences(features, prior: PriorKnowledge, spread: float = 2.0) -> np.ndarray:
+def confidences(features, prior: PriorKnowledge, spread: float = 2.0, scale=None) -> np.ndarray:
     """How much superpixels belong to the target (Li et al. 2016, eq. 2).
 
     Parameters
@@ -231,6 +371,8 @@ def confidences(features, prior: PriorKnowledge, spread: float = 2.0) -> np.ndar
         From :func:`learn`.
     spread : float
         The factor lambda of eq. 2, not negative; the paper's is 2.
+    scale : array_like, shape (S,), optional
+        What the distance of each superpixel is divided by, above 0; the radius of the cluster if not given.
 
     Returns
     -------
@@ -251,9 +393,9 @@ def confidences(features, prior: PriorKnowledge, spread: float = 2.0) -> np.ndar
     if not spread >= 0:
         raise ValueError(f"spread must not be negative, got {spread}")
     squares = codebook.squared_distances(features, prior.centers)
-    cluster = squares.argmin(axis=1)
-    distances = np.sqrt(squares.min(axis=1))
-    return np.exp(-spread * distances / prior.radii[cluster]) * prior.confidences[cluster]
+    nearest = squares.argmin(axis=1)
+    scale = prior.radii[nearest] if scale is None else np.asarray(scale, dtype=float)
+    return np.exp(-spread * np.sqrt(squares.min(axis=1)) / scale) * prior.confidences[nearest]
 
 
 def confidence_map(
@@ -290,13 +432,8 @@ def confidence_map(
     >>> confidence_map(np.roll(frame, 1, axis=1), [30, 20, 10, 20], prior)[30, [0, 29, 31, 40, 41]]
     array([-1., -1.,  1.,  1., -1.])
     """
-    left, top, right, bottom = surroundings(box, frame.shape)
-    part = frame[top:bottom, left:right]
-    labels = segment(part, n_segments, compactness)
-    painted = np.full(frame.shape[:2], -1.0)
-    of_superpixels = confidences(histograms(color.hsv_bins(part), labels), prior, spread)
-    painted[top:bottom, left:right] = of_superpixels[labels]
-    return painted
+    found = cut(frame, surroundings(box, frame.shape), n_segments, compactness)
+    return paint(found, confidences(found.features, prior, spread), frame.shape)
 
 
 def sample_boxes(box, shape, n_boxes: int, rng: np.random.Generator, factor: float = FACTOR) -> np.ndarray:

@@ -2,8 +2,18 @@
 
 from pftrack.multi.bag_of_features import BagOfFeaturesParticleFilter
 from pftrack.multi.base import MultiTracker, Track, follow, link, table
+from pftrack.multi.boosted import BoostedParticleFilter
 
-MULTI_TRACKERS = {"bof-pf": BagOfFeaturesParticleFilter}
+MULTI_TRACKERS = {"bof-pf": BagOfFeaturesParticleFilter, "boosted-pf": BoostedParticleFilter}
 """The multi-target trackers by name."""
 
-__all__ = ["MULTI_TRACKERS", "BagOfFeaturesParticleFilter", "MultiTracker", "Track", "follow", "link", "table"]
+__all__ = [
+    "MULTI_TRACKERS",
+    "BagOfFeaturesParticleFilter",
+    "BoostedParticleFilter",
+    "MultiTracker",
+    "Track",
+    "follow",
+    "link",
+    "table",
+]

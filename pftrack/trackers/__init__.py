@@ -5,12 +5,14 @@ from pftrack.trackers.camshift import CamShiftTracker
 from pftrack.trackers.color_pf import ColorParticleFilter
 from pftrack.trackers.mean_shift import MeanShiftTracker
 from pftrack.trackers.robust_pf import RobustParticleFilter
+from pftrack.trackers.superpixel import SuperpixelTracker
 
 TRACKERS = {
     "mean-shift": MeanShiftTracker,
     "camshift": CamShiftTracker,
     "color-pf": ColorParticleFilter,
     "robust-pf": RobustParticleFilter,
+    "superpixel": SuperpixelTracker,
 }
 """The trackers by name."""
 
@@ -21,6 +23,7 @@ __all__ = [
     "Estimate",
     "MeanShiftTracker",
     "RobustParticleFilter",
+    "SuperpixelTracker",
     "Tracker",
     "follow",
     "track",
