@@ -12,7 +12,7 @@ The library behind the book. A tracker is started on the first frame and updated
 
 from pftrack import color, datasets, detection, metrics, motion, multi, smc
 from pftrack.detection import PedestrianDetector
-from pftrack.multi import BagOfFeaturesParticleFilter, BoostedParticleFilter, Track
+from pftrack.multi import AssociationParticleFilter, BagOfFeaturesParticleFilter, BoostedParticleFilter, Track
 from pftrack.trackers import (
     CamShiftTracker,
     ColorParticleFilter,
@@ -27,6 +27,7 @@ from pftrack.trackers import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "AssociationParticleFilter",
     "BagOfFeaturesParticleFilter",
     "BoostedParticleFilter",
     "CamShiftTracker",

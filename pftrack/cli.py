@@ -144,7 +144,8 @@ def _parser() -> argparse.ArgumentParser:
         nargs="?",
         default="all",
         metavar="TABLE-OR-FIGURE",
-        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, bof, or all of them (the default)",
+        help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, bof, comparison, "
+        "or all of them (the default)",
     )
     reproduce.add_argument(
         "--results", type=Path, default=Path("results"), metavar="DIR", help="where to write (results)"

@@ -61,6 +61,40 @@ class Selection(Frames):
         return self.frames.read(self.indices[index])
 
 
+def light(index: int, n_frames: int, illumination: float) -> float:
+    """Return what is left of the light in a frame, when it fades evenly from 1 to ``1 - illumination``."""
+    return 1 - illumination * index / max(n_frames - 1, 1)
+
+
+class Dimmed(Frames):
+    """The frames of another list in fading light; still read one at a time.
+
+    Parameters
+    ----------
+    frames : Frames
+        The frames as they are.
+    illumination : float
+        Share of the light that is gone by the last frame, from 0 to below 1; it goes evenly.
+
+    Raises
+    ------
+    ValueError
+        If `illumination` is out of its range.
+    """
+
+    def __init__(self, frames: Frames, illumination: float):
+        if not 0 <= illumination < 1:
+            raise ValueError(f"illumination must lie in [0, 1), got {illumination}")
+        self.frames, self.illumination = frames, illumination
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def read(self, index: int) -> np.ndarray:
+        """Read a frame and darken it."""
+        return cv2.convertScaleAbs(self.frames.read(index), alpha=light(index, len(self), self.illumination))
+
+
 def image_paths(folder: Path) -> list[Path]:
     """List the image files of a folder in the order of their names; nothing if there is no such folder."""
     if not folder.is_dir():

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pftrack.datasets.frames import Frames
+from pftrack.datasets.frames import Dimmed, Frames
 from pftrack.datasets.readers import boxes_of
 
 
@@ -62,3 +62,17 @@ class Sequence:
     def boxes(self) -> np.ndarray:
         """Boxes of the first target, shape (T, 4), NaN where it is hidden or absent."""
         return self.target(self.ids[0])
+
+    def dimmed(self, illumination: float) -> Sequence:
+        """Return the same sequence in light that fades, see :class:`~pftrack.datasets.frames.Dimmed`.
+
+        Its name says so, and it has no published detections: they were not made in that light.
+
+        Examples
+        --------
+        >>> import pftrack
+        >>> scene = pftrack.datasets.load("synthetic-walk").dimmed(0.6)
+        >>> scene.name, [round(float(frame.mean())) for frame in scene.frames[::99]]
+        ('synthetic-walk (dimmed)', [125, 50])
+        """
+        return replace(self, name=f"{self.name} (dimmed)", frames=Dimmed(self.frames, illumination), detections=None)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pftrack.datasets.frames import Frames
+from pftrack.datasets.frames import Frames, light
 from pftrack.datasets.sequence import Sequence
 
 HIDDEN_BELOW = 0.1
@@ -121,7 +121,7 @@ class SyntheticFrames(Frames):
             left, right = (np.clip(edge - MARGIN - dx, 0, width) for edge in (self.pillar.start, self.pillar.stop))
             frame[:, left:right] = self.pillar_picture[MARGIN + dy : MARGIN + dy + height, : right - left]
             owner[:, left:right] = -1
-        gain = 1 - self.illumination * index / max(self.n_frames - 1, 1)
+        gain = light(index, self.n_frames, self.illumination)
         grain = self.noise * np.random.default_rng([self.seed, index]).standard_normal((height, width, 1))
         frame = np.clip(frame * gain + grain, 0, 255).astype(np.uint8)
         visible = [float((owner == n).sum() / drawn[n]) if drawn[n] else 0.0 for n in range(len(boxes))]
@@ -290,5 +290,48 @@ SCENES: dict[str, dict] = {
     "synthetic-camera": {"camera_motion": 20.0},
     "synthetic-scale": {"growth": 1.6},
     "synthetic-crowd": {"n_walkers": 5, "birth_death": True},
+    "synthetic-dusk": {"n_walkers": 4, "occlusion": 40, "illumination": 0.6},
 }
 """Ready-made scenes by id: the arguments of :func:`scene`."""
+
+
+def draw_detections(
+    film: Sequence, found: float = 0.9, error: float = 0.05, ghosts: float = 0.2, seed: int = 0
+) -> np.ndarray:
+    """Draw detections from the truth, for scenes whose people no detector of real ones finds.
+
+    Parameters
+    ----------
+    film : Sequence
+        Any sequence with true boxes.
+    found : float
+        Probability of each true box to be found.
+    error : float
+        Standard deviation of the left, top, width and height of a detection, relative to its size.
+    ghosts : float
+        Mean number of false boxes a frame. Each has the size of some true box, and may be anywhere in any frame.
+    seed : int
+        Seed of the random numbers.
+
+    Returns
+    -------
+    ndarray, shape (R, 7)
+        A table of detections, see :mod:`pftrack.datasets.readers`: ``frame, id, x, y, w, h, score`` with id -1 and
+        score 1.
+
+    Examples
+    --------
+    >>> film = scene(n_frames=50)
+    >>> len(film.tracks), len(draw_detections(film, ghosts=0)), len(draw_detections(film, found=1, ghosts=0))
+    (50, 45, 50)
+    """
+    rng = np.random.default_rng(seed)
+    table = film.tracks[rng.random(len(film.tracks)) < found]
+    false = film.tracks[rng.integers(len(film.tracks), size=rng.poisson(ghosts * len(film)))].copy()
+    false[:, 0] = rng.integers(len(film), size=len(false))
+    height, width = film.frames[0].shape[:2]
+    false[:, 2:4] = rng.uniform(0, [width, height] - false[:, 4:6])
+    table = np.concatenate([table, false])
+    table[:, 2:6] += rng.normal(0, error, (len(table), 4)) * table[:, [4, 5, 4, 5]]
+    table[:, [1, 6]] = -1, 1
+    return table

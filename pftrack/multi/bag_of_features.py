@@ -30,7 +30,7 @@ import numpy as np
 from pftrack import codebook, motion, patches, smc, superpixels
 from pftrack.checks import check_box, check_picture, check_same_size, check_seed
 from pftrack.detection import PedestrianDetector
-from pftrack.multi.base import Track, link
+from pftrack.multi.base import Track, link, stream
 
 FEATURES = ("color", "texture")
 """The two kinds of patches, in the order in which everything here has them."""
@@ -281,8 +281,7 @@ class _Target:
 
     def __init__(self, number: int, seen: list[tuple[np.ndarray, np.ndarray]], settings: BagOfFeaturesParticleFilter):
         self.settings = settings
-        seed = settings.seed
-        self.rng = seed.spawn(1)[0] if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, number])
+        self.rng = stream(settings.seed, number)
         self.box = seen[-1][1]
         factor = superpixels.FACTOR if settings.discriminative else 1.0
         self.training = []

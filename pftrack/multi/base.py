@@ -31,7 +31,7 @@ class Track:
     score : float
         Confidence from 0 to 1; what it measures is said by each tracker.
     held : bool
-        Whether the target is too hidden to be measured, so that the last box is kept.
+        Whether the target is too hidden to be measured, so that its box is the last one, or where it is expected.
     particles : ndarray, shape (N, 4), or None
         The particles before resampling, ``[x, y, w, h]`` with `x` and `y` of the *centre*.
     weights : ndarray, shape (N,), or None
@@ -47,6 +47,54 @@ class Track:
     particles: np.ndarray | None = None
     weights: np.ndarray | None = None
     color_weight: float = float("nan")
+
+
+def stream(seed, number: int) -> np.random.Generator:
+    """Random numbers of one target, whatever the others need of theirs.
+
+    Parameters
+    ----------
+    seed : int or numpy.random.Generator
+        Seed of the tracker.
+    number : int
+        Number of the target.
+
+    Returns
+    -------
+    numpy.random.Generator
+        A stream that depends on both, or the next child of the generator.
+    """
+    return seed.spawn(1)[0] if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, number])
+
+
+def check_detections(detections) -> np.ndarray:
+    """Return detections as an array, or say what is wrong with them.
+
+    Parameters
+    ----------
+    detections : array_like, shape (D, 5)
+        ``x, y, w, h, score`` of each, in pixels; possibly none.
+
+    Returns
+    -------
+    ndarray, shape (D, 5)
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If they are no rows of five numbers, or a box is empty or not finite.
+
+    Examples
+    --------
+    >>> check_detections([]).shape
+    (0, 5)
+    """
+    found = np.asarray(detections, dtype=float)
+    found = found.reshape(-1, 5) if found.size == 0 else found
+    if found.ndim != 2 or found.shape[1] != 5 or not np.isfinite(found).all() or not (found[:, 2:4] > 0).all():
+        raise ValueError(f"detections must be rows x, y, w, h, score with boxes that are not empty, got {detections!r}")
+    return found
 
 
 class MultiTracker(Protocol):

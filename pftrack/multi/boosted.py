@@ -48,7 +48,7 @@ from pftrack.adaboost import AdaBoostDetector
 from pftrack.checks import check_box, check_picture, check_same_size, check_seed
 from pftrack.detection import merge
 from pftrack.metrics import pairwise_overlap
-from pftrack.multi.base import Track
+from pftrack.multi.base import Track, check_detections, stream
 
 N_LEVELS = 10
 """Levels of hue, of saturation and of value; 10 x 10 + 10 bins in all."""
@@ -322,7 +322,7 @@ class BoostedParticleFilter:
             If the frame is no colour image, or not of the size of those before, or the detections are no boxes.
         """
         check_same_size(check_picture(frame).shape, self._shape)
-        found = _check_detections(self.detector.detect(frame) if detections is None else detections)
+        found = check_detections(self.detector.detect(frame) if detections is None else detections)[:, :4]
         self._shape = frame.shape
         bins = color_bins(frame)
         explained = np.zeros(len(found), dtype=bool)
@@ -380,8 +380,7 @@ class _Component:
 
     def __init__(self, number: int, box: np.ndarray, bins: np.ndarray, settings: BoostedParticleFilter):
         self.settings = settings
-        seed = settings.seed
-        self.rng = seed.spawn(1)[0] if isinstance(seed, np.random.Generator) else np.random.default_rng([seed, number])
+        self.rng = stream(settings.seed, number)
         x, y, w, h = box
         self.size = np.array([w, h])
         self.colors = kernels.palette(color.histograms(bins, _halves([box]), outside="ignore"))
@@ -441,15 +440,6 @@ def _three(given, name: str) -> np.ndarray:
     if given.shape != (3,) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be three finite numbers, of x, y and scale, got {given.tolist()}")
     return given
-
-
-def _check_detections(detections) -> np.ndarray:
-    """Return the boxes of detections, or say what is wrong with them."""
-    found = np.asarray(detections, dtype=float)
-    found = found.reshape(-1, 5) if found.size == 0 else found
-    if found.ndim != 2 or found.shape[1] != 5 or not np.isfinite(found[:, :4]).all() or not (found[:, 2:4] > 0).all():
-        raise ValueError(f"detections must be rows x, y, w, h, score with boxes that are not empty, got {detections!r}")
-    return found[:, :4]
 
 
 def _shown(box, frame) -> bool:

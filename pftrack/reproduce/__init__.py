@@ -3,7 +3,7 @@
 Each item of :data:`ITEMS` takes a :class:`~pftrack.reproduce.plan.Plan` and writes one or two files below
 ``results/``; ``pftrack reproduce`` runs them. The files are plain CSV under lines ``# key: value`` that say the
 settings, versions and machine; :func:`~pftrack.reproduce.plan.read` gives both. What has been computed is kept in the
-user's cache, so an interrupted item goes on where it stopped, and items share their runs. Chapters 6 to 10 show the
+user's cache, so an interrupted item goes on where it stopped, and items share their runs. Chapters 6 to 12 show the
 files and re-run a part of them.
 
 In the items of one pedestrian (:mod:`pftrack.reproduce.one`) overlaps and hits are given twice, over ``all`` frames, a
@@ -37,12 +37,14 @@ from pftrack.reproduce.one import (
     variations,
 )
 from pftrack.reproduce.plan import PARTICLES, Plan, machine, read, spread, write
+from pftrack.reproduce.rivals import PRINTED, comparison
 
 __all__ = [
     "BARE",
     "ITEMS",
     "PAPER",
     "PARTICLES",
+    "PRINTED",
     "Plan",
     "ablation_steps",
     "bof_steps",
@@ -64,6 +66,7 @@ ITEMS = {
     "ablation": ablation,
     "detection": detection,
     "bof": bof,
+    "comparison": comparison,
 }
 """What can be reproduced, by name, in the order in which ``all`` does it."""
 

@@ -6,7 +6,6 @@ import time
 from pathlib import Path
 
 import cv2
-import joblib
 import numpy as np
 import pandas as pd
 from tqdm.auto import tqdm
@@ -14,7 +13,6 @@ from tqdm.auto import tqdm
 from pftrack import datasets, metrics, multi
 from pftrack.datasets.readers import boxes_of
 from pftrack.detection import PedestrianDetector, detect
-from pftrack.experiments import LIBRARY
 from pftrack.reproduce.plan import Plan
 
 PLAIN = {"trimmed": False, "weighted": False, "min_windows": 1, "min_foreground": 0.0, "size_prior": False}
@@ -152,20 +150,20 @@ def bof(plan: Plan) -> list[Path]:
     error over targets, and in how many runs two targets changed their names. Errors are in pixels.
     """
     seeds = range(min(plan.n_runs, 10))
-    tasks = [({}, id, seed, known, None) for known in (True, False) for id in plan.followed for seed in seeds]
+    runs = [({}, id, seed, known, None) for known in (True, False) for id in plan.followed for seed in seeds]
     ablated = [
         (settings, id, seed, True, AT_MOST) for _, settings in bof_steps() for id in plan.followed for seed in seeds
     ]
-    rows = _followed(plan, tasks + ablated)
-    whole = pd.concat(rows[: len(tasks)], ignore_index=True)
+    rows = _followed(plan, runs + ablated)
+    whole = pd.concat(rows[: len(runs)], ignore_index=True)
     parts = []
     for n, (name, _) in enumerate(bof_steps()):
-        begin = len(tasks) + n * len(plan.followed) * len(seeds)
+        begin = len(runs) + n * len(plan.followed) * len(seeds)
         step = pd.concat(rows[begin : begin + len(plan.followed) * len(seeds)])
         for id, of_sequence in step.groupby("sequence", sort=False):
-            runs = of_sequence.groupby("seed").agg({"center_error": "mean", "swapped": "max"})
-            errors = runs["center_error"]
-            parts.append([name, id, errors.mean(), errors.std(ddof=1), int(runs["swapped"].sum()), len(runs)])
+            by_seed = of_sequence.groupby("seed").agg({"center_error": "mean", "swapped": "max"})
+            errors = by_seed["center_error"]
+            parts.append([name, id, errors.mean(), errors.std(ddof=1), int(by_seed["swapped"].sum()), len(by_seed)])
     columns = ["setting", "sequence", "center_error_mean", "center_error_sd", "swaps", "runs"]
     about = {"sequence": " ".join(plan.followed), "seeds": len(seeds), "training": N_TRAINING}
     return [
@@ -174,50 +172,109 @@ def bof(plan: Plan) -> list[Path]:
     ]
 
 
-def _followed(plan: Plan, tasks) -> list[pd.DataFrame]:
-    """Do the runs, taking from the store what is there."""
-    memory = joblib.Memory(plan.folder / "many", verbose=0)
-    run = joblib.delayed(memory.cache(_follow))
-    parallel = joblib.Parallel(-1 if plan.n_jobs is None else plan.n_jobs, return_as="generator")
-    done = parallel(run(LIBRARY, *task) for task in tasks)
-    return list(tqdm(done, total=len(tasks), unit="run", disable=not plan.progress))
+def _followed(plan: Plan, runs) -> list[pd.DataFrame]:
+    """Do the runs, taking from the store what is there, and score each target of each."""
+    films = {id: datasets.load(id, plan.progress) for id in plan.followed}
+    casts = {(id, n): seen_in_training(films[id], N_TRAINING, n) for id in films for n in (None, AT_MOST)}
+    tasks = []
+    for settings, id, seed, known, at_most in runs:
+        _, truth = casts[id, at_most]
+        given = truth[:N_TRAINING] if known else None
+        tasks.append(({"n_training": N_TRAINING} | settings, id, len(truth), given, seed))
+    found = plan.each(_follow, tasks)
+    return [
+        _score(tracks, *casts[id, at_most], films[id], {"sequence": id, "seed": seed, "known": known})
+        for tracks, (_, id, seed, known, at_most) in zip(found, runs, strict=True)
+    ]
 
 
-def _follow(library: str, settings: dict, id: str, seed: int, known: bool, at_most: int | None) -> pd.DataFrame:
-    """Follow the targets of a sequence that are seen in all training frames, and score each."""
-    film = datasets.load(id, progress=False)
-    n_frames = min(len(film), at_most or len(film))
-    in_training = [set(film.tracks[film.tracks[:, 0] == t, 1].astype(int)) for t in range(N_TRAINING)]
-    targets = [target for target in film.ids if all(target in seen for seen in in_training)]
-    truth = {target: boxes_of(film.tracks, target, len(film))[:n_frames] for target in targets}
-    ends = max(int(np.flatnonzero(np.isfinite(boxes[:, 0]))[-1]) for boxes in truth.values()) + 1
-    frames = film.frames[:ends]
-    tracker = multi.BagOfFeaturesParticleFilter(seed=seed, n_training=N_TRAINING, **settings)
-    if known:
-        first = frames[:N_TRAINING]
-        tracker.init(list(first), np.stack([truth[target][:N_TRAINING] for target in targets], axis=1))
-        found = multi.table([*[[]] * N_TRAINING, *multi.follow(tracker, frames[N_TRAINING:])])
+def _follow(library: str, settings: dict, id: str, n_frames: int, known, seed: int) -> np.ndarray:
+    """Follow the targets of a sequence, known or found in the training frames; return the table of tracks."""
+    frames = datasets.load(id, progress=False).frames[:n_frames]
+    tracker = multi.BagOfFeaturesParticleFilter(seed=seed, **settings)
+    if known is None:
+        return multi.table(multi.follow(tracker, frames))
+    n_training = len(known)
+    tracker.init(list(frames[:n_training]), known)
+    return multi.table([*[[]] * n_training, *multi.follow(tracker, frames[n_training:])])
+
+
+def _score(tracks, targets: list[int], truth, film: datasets.Sequence, about: dict) -> pd.DataFrame:
+    if about["known"]:
         ids = {target: n for n, target in enumerate(targets, start=1)}
     else:
-        found = multi.table(multi.follow(tracker, frames))
-        ids = metrics.match_targets(found, film.tracks, N_TRAINING - 1)
-        ids = {target: ids[target] for target in targets if target in ids}
-    middles = {target: _centers(truth[target][:ends]) for target in targets}
+        ids = metrics.match_targets(tracks, film.tracks, N_TRAINING - 1)
     rows = []
-    for target in targets:
-        error, n_compared, swapped = np.nan, 0, np.nan
+    for n, target in enumerate(targets):
+        error, n_compared, is_swapped = np.nan, 0, np.nan
         if target in ids:
-            center = _centers(boxes_of(found, ids[target], ends))
-            distances = np.linalg.norm(center - np.array([middles[each] for each in targets]), axis=2)
-            own = distances[targets.index(target)]
-            compared = np.isfinite(own)
-            error, n_compared = own[compared].mean(), compared.sum()
-            late = np.flatnonzero(compared)[-AFTER:]
-            nearest = np.nan_to_num(distances[:, late], nan=np.inf).mean(axis=1).argmin()
-            swapped = float(nearest != targets.index(target))
-        rows.append([id, target, seed, known, error, n_compared, swapped])
-    return pd.DataFrame(rows, columns=["sequence", "target", "seed", "known", "center_error", "frames", "swapped"])
+            track = boxes_of(tracks, ids[target], len(truth))
+            errors = metrics.center_error(track, truth[:, n])
+            error, n_compared = np.nanmean(errors), np.isfinite(errors).sum()
+            is_swapped = swapped(track, n, truth, AFTER)
+        measures = {"center_error": error, "frames": n_compared, "swapped": is_swapped}
+        rows.append(about | {"target": target} | measures)
+    return pd.DataFrame(rows)[["sequence", "target", "seed", "known", *measures]]
 
 
-def _centers(boxes) -> np.ndarray:
-    return boxes[:, :2] + boxes[:, 2:] / 2
+def seen_in_training(
+    film: datasets.Sequence, n_training: int, at_most: int | None = None
+) -> tuple[list[int], np.ndarray]:
+    """Find the targets that are seen in all training frames.
+
+    Parameters
+    ----------
+    film : Sequence
+        The sequence.
+    n_training : int
+        How many training frames there are.
+    at_most : int, optional
+        Frames of the sequence to use; all if not given.
+
+    Returns
+    -------
+    targets : list of int
+        Their ids.
+    truth : ndarray, shape (T, K, 4)
+        Their boxes, NaN where they are hidden, up to the frame in which the last of them is seen last.
+    """
+    truth = {target: film.target(target)[:at_most] for target in film.ids}
+    targets = [target for target, boxes in truth.items() if np.isfinite(boxes[:n_training]).all()]
+    boxes = np.stack([truth[target] for target in targets], axis=1)
+    end = np.flatnonzero(np.isfinite(boxes).any(axis=(1, 2)))[-1] + 1
+    return targets, boxes[:end]
+
+
+def swapped(track, which: int, truth: np.ndarray, n_last: int) -> float:
+    """Tell whether a track has ended up with another than its target.
+
+    Parameters
+    ----------
+    track : array_like, shape (T, 4)
+        Boxes of the track, NaN where there is none.
+    which : int
+        Whom of the targets it should follow, from 0.
+    truth : ndarray, shape (T, K, 4)
+        Boxes of all targets, NaN where they are hidden.
+    n_last : int
+        In how many of the last frames that show both target and track the centres are compared.
+
+    Returns
+    -------
+    float
+        1 if another target was nearer, in the mean; 0 if not; NaN if no frame shows both target and track.
+
+    Examples
+    --------
+    Two walk towards each other, and the track turns round with the first half-way:
+
+    >>> one = np.array([[x, 0.0, 10.0, 20.0] for x in (0, 20, 40, 60, 80)])
+    >>> truth, track = np.stack([one, one[::-1]], axis=1), one[[0, 1, 2, 1, 0]]
+    >>> swapped(track, 0, truth, n_last=2), swapped(track, 0, truth, n_last=5)
+    (1.0, 0.0)
+    """
+    distances = np.array([metrics.center_error(track, boxes) for boxes in truth.swapaxes(0, 1)])
+    late = np.flatnonzero(np.isfinite(distances[which]))[-n_last:]
+    if not len(late):
+        return float("nan")
+    return float(np.nan_to_num(distances[:, late], nan=np.inf).mean(axis=1).argmin() != which)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import joblib
 import numpy as np
 import pandas as pd
+from tqdm.auto import tqdm
 
 import pftrack
 from pftrack import experiments
 from pftrack.datasets import registry
-from pftrack.experiments import Run
+from pftrack.experiments import LIBRARY, Run
 from pftrack.files import replacing
 
 PARTICLES = (10, 20, 35, 50, 75, 100, 200, 350, 500, 1000, 2000)
@@ -79,6 +81,18 @@ class Plan:
     def run(self, runs: Iterable[Run]) -> list[np.ndarray]:
         """Compute the boxes of runs, taking from the store what is there."""
         return experiments.run(runs, store=self.folder, n_jobs=self.n_jobs, progress=self.progress)
+
+    def each(self, function: Callable, tasks: Sequence[tuple]) -> list:
+        """Call a function with the arguments of each task, taking from the store what is there.
+
+        What the result depends on must be among the arguments. The first always is the version of the library, which
+        includes all but the programs on top of it, such as this one.
+        """
+        memory = joblib.Memory(self.folder / "many", verbose=0)
+        call = joblib.delayed(memory.cache(function))
+        parallel = joblib.Parallel(-1 if self.n_jobs is None else self.n_jobs, return_as="generator")
+        done = parallel(call(LIBRARY, *task) for task in tasks)
+        return list(tqdm(done, total=len(tasks), unit="run", disable=not self.progress))
 
     def write(self, name: str, table: pd.DataFrame, **about) -> Path:
         """Write a file of the results; see :func:`write`."""
