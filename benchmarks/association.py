@@ -67,27 +67,9 @@ def detections(film: datasets.Sequence, source: str) -> np.ndarray:
     if source == "published":
         return film.detections
     if source == "drawn":
-        return draw(film)
+        return datasets.synthetic.draw_detections(film)
     store = registry.cache_folder() / "experiments" / "detection"  # that of pftrack reproduce detection
     return pftrack.detection.detect(film.frames, store=store, progress=True)
-
-
-def draw(film: datasets.Sequence, found: float = 0.9, error: float = 0.05, ghosts: float = 0.2) -> np.ndarray:
-    """Draw detections from the truth: some boxes are missing, all are a little off, and some frames have one too many.
-
-    `found` is the probability of a true box to be found, `error` the standard deviation of its left, top, width and
-    height relative to its size, and `ghosts` the number of false boxes a frame. All scores are 1.
-    """
-    rng = np.random.default_rng(0)
-    table = film.tracks[rng.random(len(film.tracks)) < found]
-    false = film.tracks[rng.integers(len(film.tracks), size=rng.poisson(ghosts * len(film)))].copy()
-    false[:, 0] = rng.integers(len(film), size=len(false))
-    height, width = film.frames[0].shape[:2]
-    false[:, 2:4] = rng.uniform(0, [width, height] - false[:, 4:6])
-    table = np.concatenate([table, false])
-    table[:, 2:6] += rng.normal(0, error, (len(table), 4)) * table[:, [4, 5, 4, 5]]
-    table[:, 1] = -1
-    return table
 
 
 # ---------------------------------------------------------------------------------------------------------------------

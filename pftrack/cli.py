@@ -9,6 +9,7 @@ import argparse
 import collections
 import contextlib
 import csv
+import inspect
 import itertools
 import json
 import math
@@ -117,7 +118,7 @@ def _parser() -> argparse.ArgumentParser:
 
     many = commands.add_parser("multi", help="follow many pedestrians through a film")
     many.add_argument("source", metavar="SOURCE", help="a dataset id, a video file, or a folder of images")
-    many.add_argument("--tracker", default="bof-pf", metavar="NAME", help=", ".join(MULTI_TRACKERS))
+    many.add_argument("--tracker", default="association-pf", metavar="NAME", help=", ".join(MULTI_TRACKERS))
     many.add_argument("--particles", type=int, metavar="N", help="particles of each target (300)")
     many.add_argument("--seed", type=int, metavar="S", help="seed of the random numbers (0)")
     many.add_argument("--detections", type=Path, metavar="FILE", help="MOTChallenge detections, in place of our own")
@@ -145,7 +146,7 @@ def _parser() -> argparse.ArgumentParser:
         default="all",
         metavar="TABLE-OR-FIGURE",
         help="table2, fig3, fig6a, fig6b, sensitivity, ablation, detection, bof, comparison, "
-        "or all of them (the default)",
+        "association, or all of them (the default)",
     )
     reproduce.add_argument(
         "--results", type=Path, default=Path("results"), metavar="DIR", help="where to write (results)"
@@ -194,12 +195,13 @@ def _track(options: argparse.Namespace) -> None:
 def _make_tracker(options: argparse.Namespace, kinds: dict[str, type] = TRACKERS):
     if options.tracker not in kinds:
         raise ValueError(f"unknown tracker {options.tracker!r}; choose one of {', '.join(kinds)}")
+    kind = kinds[options.tracker]
     settings = {"n_particles": options.particles, "seed": options.seed}
     settings = {name: value for name, value in settings.items() if value is not None}
-    try:
-        return kinds[options.tracker](**settings)
-    except TypeError:
-        raise ValueError(f"{options.tracker} has no particles and no seed") from None
+    for name in settings:
+        if name not in inspect.signature(kind).parameters:
+            raise ValueError(f"{options.tracker} has no {name.removeprefix('n_')}")
+    return kind(**settings)
 
 
 def _open_source(options: argparse.Namespace) -> tuple[datasets.Frames, float, datasets.Sequence | None]:

@@ -430,20 +430,20 @@ def test_ctrl_c_leaves_no_file_and_exits_130(film, tmp_path, out):
 
 @pytest.fixture
 def found(tmp_path):
-    """Detections of the one target of the film, frames from 1, and where it goes."""
+    """Detections of the one target of the film, frames from 1."""
     path = tmp_path / "det.txt"
-    path.write_text("".join(f"{n + 1},-1,{10 + 2 * n},20,16,30,1,-1,-1,-1\n" for n in range(5)))
+    path.write_text("".join(f"{n + 1},-1,{10 + 2 * n},20,16,30,1,-1,-1,-1\n" for n in range(N_FRAMES)))
     return path
 
 
 def test_the_mot_file_holds_what_python_computes(film, found, out, capfd):
     assert run("multi", film, "--detections", found, "--particles", 40, "--seed", 3, "--mot", out / "a.txt") == 0
     assert capfd.readouterr().out == f"{N_FRAMES} frames, 1 pedestrians\n"
-    tracker = pftrack.BagOfFeaturesParticleFilter(40, seed=3)
+    tracker = pftrack.AssociationParticleFilter(40, seed=3)
     frames = datasets.open_frames(film)
     rows = multi.table(multi.follow(tracker, frames, datasets.readers.read_mot(found)))
     np.testing.assert_allclose(datasets.readers.read_mot(out / "a.txt"), rows, rtol=1e-4)
-    np.testing.assert_array_equal(rows[:, 0], np.arange(4, N_FRAMES))
+    np.testing.assert_array_equal(rows[:, 0], np.arange(2, N_FRAMES))  # from the third frame it is seen in
     np.testing.assert_allclose(rows[:, 2], 10 + 2 * rows[:, 0], atol=4)
 
 
@@ -465,7 +465,7 @@ def test_a_film_without_pedestrians_has_none(film, out, capfd):
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        (["--tracker", "color-pf"], "choose one of bof-pf"),
+        (["--tracker", "color-pf"], "choose one of bof-pf, boosted-pf, association-pf"),
         (["--particles", "0"], "at least 1"),
         (["--seed", "-1"], "seed"),
         (["--detections", "no.txt"], "there is no file no.txt"),
@@ -670,7 +670,7 @@ def test_what_multi_writes_evaluate_reads(film, found, out, capfd):
     assert run("evaluate", out / "tracks.txt", write_rows(out / "truth.txt", truth), "--json") == 0
     expected = metrics.multi_target(readers.read_mot(out / "tracks.txt"), truth)
     assert json.loads(capfd.readouterr().out) == pytest.approx(expected.as_dict())
-    assert expected.n_matched == N_FRAMES - 4  # it learns for four frames
+    assert expected.n_matched == N_FRAMES - 2  # it waits for the third frame
 
 
 BAD_ROWS = {

@@ -17,7 +17,7 @@ import pftrack
 from pftrack import datasets, detection, experiments, masks, metrics, reproduce
 from pftrack.cli import main
 from pftrack.datasets import registry
-from pftrack.reproduce import Plan, many
+from pftrack.reproduce import Plan, many, rivals
 
 SCENE = "synthetic-occlusion"
 N_FRAMES = 70
@@ -489,3 +489,146 @@ def test_the_errors_of_the_bag_of_features_filter_are_those_of_its_runs(plan, mo
     assert (ablation["runs"] == 2).all()
     assert (ablation["swaps"] == 0).all()
     assert ablation["center_error_mean"].iloc[0] != ablation["center_error_mean"].iloc[1]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The comparison
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def walk(*places) -> np.ndarray:
+    """Boxes 10 wide and 20 high with their left edges at some places; nowhere at NaN."""
+    return np.array([[x, 0.0, 10.0, 20.0] if np.isfinite(x) else [np.nan] * 4 for x in places])
+
+
+GONE = float("nan")
+
+
+def test_a_track_that_ends_keeps_its_last_box_and_so_does_one_that_pauses():
+    truth = walk(0, 2, 4, 6, 8, 10)[:, None]
+    found = rivals.score(walk(0, 3, GONE, 6, GONE, GONE), 0, truth, begin=1, n_last=20)
+    assert found["center_error"] == pytest.approx(np.mean([1, 1, 0, 2, 4]))
+    assert found["frames"] == 5
+    assert found["reported"] == pytest.approx(2 / 5)
+    assert found["right"] == pytest.approx(2 / 5)
+    assert found["swapped"] == 0
+
+
+def test_a_track_that_never_was_stays_where_the_target_was_last_shown():
+    truth = walk(0, 2, 4, 6)[:, None]
+    found = rivals.score(walk(*[GONE] * 4), 0, truth, begin=2, n_last=20)
+    assert found["center_error"] == pytest.approx(np.mean([2, 4]))
+    assert (found["frames"], found["reported"], found["right"]) == (2, 0, 0)
+    assert np.isnan(found["swapped"])
+
+
+def test_only_frames_after_the_training_in_which_the_target_is_seen_are_compared():
+    truth = walk(0, 0, 0, GONE, 0)[:, None]
+    found = rivals.score(walk(50, 50, 3, 90, 4), 0, truth, begin=2, n_last=20)
+    assert found["center_error"] == pytest.approx(3.5)
+    assert found["frames"] == 2
+    assert found["reported"] == 1
+    assert found["right"] == pytest.approx(1 / 2)  # 3 off, 70 of 130 pixels overlap; 4 off, 60 of 140
+
+
+def test_a_track_is_swapped_when_it_ends_nearer_to_another():
+    one, other = walk(0, 10, 20, 30, 40), walk(40, 30, 20, 10, 0)
+    truth = np.stack([one, other], axis=1)
+    assert many.swapped(one, 0, truth, n_last=2) == 0
+    assert many.swapped(one, 1, truth, n_last=2) == 1
+    assert many.swapped(other, 0, truth, n_last=2) == 1
+    early = np.where(np.arange(5)[:, None] < 2, one, np.nan)
+    assert many.swapped(early, 0, truth, n_last=2) == 0  # it ended before they met
+    truth[3:, 1] = np.nan
+    assert many.swapped(other, 0, truth, n_last=2) == 0  # nobody was there any more
+
+
+def test_those_seen_in_all_training_frames_are_followed_until_the_last_leaves():
+    rows = [
+        [t, id, 0, 0, 10, 20, 1] for id, frames in {3: [0, 1, 2, 5], 4: [0, 1], 5: [1, 2, 3]}.items() for t in frames
+    ]
+    film = dataclasses.replace(scene(), tracks=np.array(rows, dtype=float))
+    targets, truth = many.seen_in_training(film, n_training=2)
+    assert targets == [3, 4]
+    assert np.isfinite(truth[:, :, 0]).tolist() == [[True, True]] * 2 + [[t in (2, 5), False] for t in range(2, 6)]
+    assert len(many.seen_in_training(film, 2, at_most=5)[1]) == 3
+
+
+@functools.cache
+def pair(id: str) -> datasets.Sequence:
+    """A short scene of two walkers, under any name."""
+    return dataclasses.replace(datasets.synthetic.scene(n_frames=9, n_walkers=2), name=id)
+
+
+def by_hand(name: str, film: datasets.Sequence, table: np.ndarray) -> np.ndarray:
+    """Boxes that a tracker with seed 0 finds of both walkers in the last four frames, shape (4, 2, 4)."""
+    truth = np.stack([film.target(1), film.target(2)], axis=1)
+    frames = list(film.frames)
+    if name == "superpixel":
+        trackers = [pftrack.SuperpixelTracker(seed=0) for _ in range(2)]
+        for n, tracker in enumerate(trackers):
+            tracker.init_from(frames[:5], truth[:5, n])
+        return np.array([[tracker.update(frame).box for tracker in trackers] for frame in frames[5:]])
+    if name == "bof-pf":
+        tracker = pftrack.BagOfFeaturesParticleFilter(seed=0)
+        tracker.init(frames[:5], truth[:5])
+        return np.array([[track.box for track in tracker.update(frame)] for frame in frames[5:]])
+    kind = pftrack.BoostedParticleFilter if name.startswith("boosted") else pftrack.AssociationParticleFilter
+    tracker = kind(seed=0, **({"as_printed": True} if "printed" in name else {}))
+    for frame, boxes in zip(frames[:5], truth[:5], strict=True):
+        first = tracker.update(frame, [[*box, 5.0] for box in boxes])
+    assert len(first) == 2
+    known = [int(np.argmax([metrics.pairwise_overlap([track.box], [box]) for track in first])) for box in truth[4]]
+    boxes = []
+    for t, frame in enumerate(frames[5:], start=5):
+        detections = None if "AdaBoost" in name else table[table[:, 0] == t, 2:]
+        found = {track.id: track.box for track in tracker.update(frame, detections)}
+        boxes.append([found.get(first[n].id, np.full(4, np.nan)) for n in known])
+    return np.array(boxes)
+
+
+def test_the_comparison_is_that_of_runs_made_by_hand(plan, monkeypatch):
+    monkeypatch.setattr(datasets, "load", lambda id, progress=True: pair(id))
+    plan = dataclasses.replace(plan, n_runs=1, followed=("one",))
+    (table,) = made("comparison", plan)
+    assert list(table["sequence"].unique()) == ["one", "one (dimmed)", rivals.DRAWN]
+    assert len(table) == 3 * len(rivals.TRACKERS) * 2
+    assert table.attrs["sequence"] == f"one, one (dimmed), {rivals.DRAWN}"
+    drawn = datasets.synthetic.draw_detections(pair("any"))
+    for film in (pair("one"), pair("one").dimmed(0.6), pair(rivals.DRAWN)):
+        found = drawn if film.name == rivals.DRAWN else detection.detect(film.frames)
+        for name in rivals.TRACKERS:
+            boxes = by_hand(name, film, found)
+            rows = table[(table["sequence"] == film.name) & (table["tracker"] == name)]
+            assert rows["target"].tolist() == [1, 2]
+            for n, row in enumerate(rows.to_dict("records")):
+                true = film.target(n + 1)[5:]
+                there = np.isfinite(boxes[:, n, 0])
+                assert row["reported"] == pytest.approx(there.mean())
+                assert row["right"] == pytest.approx((metrics.overlap(boxes[:, n], true) >= 0.5).mean())
+                assert row["frames"] == 4
+                if there.all():
+                    errors = metrics.center_error(boxes[:, n], true)
+                    assert row["center_error"] == pytest.approx(errors.mean(), abs=1e-5)
+
+
+def test_the_comparison_takes_from_its_store_what_depends_on_nothing_new(plan, monkeypatch):
+    monkeypatch.setattr(datasets, "load", lambda id, progress=True: pair(id))
+    plan = dataclasses.replace(plan, n_runs=1, followed=("one",))
+    settings = {"n_particles": 20}
+    monkeypatch.setattr(rivals, "TRACKERS", {"boosted-pf": (pftrack.BoostedParticleFilter, settings, "HOG")})
+    (first,) = made("comparison", plan)
+    monkeypatch.setattr(rivals, "TRACKERS", {"boosted-pf": (None, settings, "HOG")})  # nothing that could run
+    pd.testing.assert_frame_equal(made("comparison", plan)[0], first)
+    for name, value in {"CERTAIN": 4.0, "N_TRAINING": 4, "DIMMED": 0.5, "AT_MOST": {"one": 8}}.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(rivals, name, value)
+            with pytest.raises(TypeError, match="NoneType"):
+                made("comparison", plan)
+
+
+def test_the_printed_tables_have_a_number_for_every_pedestrian_and_tracker():
+    lengths = {table: {len(errors) for errors in rows.values()} for table, rows in reproduce.PRINTED.items()}
+    assert lengths == {"Table 3": {3}, "Table 4": {5}, "Table 5": {3}}
+    assert {tuple(rows) for rows in reproduce.PRINTED.values()} == {("superpixel", "boosted-pf", "association-pf")}
+    assert set(reproduce.PRINTED["Table 3"]) < set(rivals.TRACKERS)

@@ -290,7 +290,7 @@ SCENES: dict[str, dict] = {
     "synthetic-camera": {"camera_motion": 20.0},
     "synthetic-scale": {"growth": 1.6},
     "synthetic-crowd": {"n_walkers": 5, "birth_death": True},
-    "synthetic-dusk": {"n_walkers": 4, "occlusion": 40, "illumination": 0.6},
+    "synthetic-dusk": {"n_walkers": 4, "illumination": 0.6},
 }
 """Ready-made scenes by id: the arguments of :func:`scene`."""
 

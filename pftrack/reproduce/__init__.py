@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from pftrack.reproduce.crowd import association, association_steps
 from pftrack.reproduce.many import bof, bof_steps, detection, detectors
 from pftrack.reproduce.one import (
     BARE,
@@ -47,6 +48,7 @@ __all__ = [
     "PRINTED",
     "Plan",
     "ablation_steps",
+    "association_steps",
     "bof_steps",
     "detectors",
     "machine",
@@ -67,6 +69,7 @@ ITEMS = {
     "detection": detection,
     "bof": bof,
     "comparison": comparison,
+    "association": association,
 }
 """What can be reproduced, by name, in the order in which ``all`` does it."""
 

@@ -12,7 +12,7 @@ import pytest
 
 import pftrack
 from pftrack import video
-from pftrack.datasets.frames import Frames, ImageFrames, VideoFrames, open_frames
+from pftrack.datasets.frames import Dimmed, Frames, ImageFrames, VideoFrames, open_frames
 
 N_FRAMES = 24
 
@@ -29,6 +29,19 @@ class Recorder(Frames):
     def read(self, index):
         self.reads.append(index)
         return index
+
+
+class Pictures(Frames):
+    """Frames that are held in memory."""
+
+    def __init__(self, pictures):
+        self.pictures = pictures
+
+    def __len__(self):
+        return len(self.pictures)
+
+    def read(self, index):
+        return self.pictures[index]
 
 
 def picture(index: int) -> np.ndarray:
@@ -123,6 +136,47 @@ def test_an_index_beyond_either_end_raises_index_error(index):
 def test_an_index_beyond_a_slice_does_not_reach_into_the_rest():
     with pytest.raises(IndexError, match="of 3"):
         Recorder()[2:5][3]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Fading light
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+class Grey(Recorder):
+    """Ten frames that are grey all over, as bright as 200."""
+
+    def read(self, index):
+        super().read(index)
+        return np.full((4, 6, 3), 200, np.uint8)
+
+
+def test_light_fades_evenly_from_all_to_what_is_left():
+    frames = Dimmed(Grey(), 0.9)
+    assert len(frames) == 10
+    assert [int(frame[0, 0, 0]) for frame in frames] == [200, 180, 160, 140, 120, 100, 80, 60, 40, 20]
+    assert {frame.shape for frame in frames} == {(4, 6, 3)}
+    assert {frame.dtype for frame in frames} == {np.dtype(np.uint8)}
+
+
+def test_a_part_of_a_dimmed_film_is_as_dark_as_in_the_whole_and_read_when_it_is_asked_for():
+    grey = Grey()
+    last = Dimmed(grey, 0.9)[-2:]
+    assert grey.reads == []
+    assert [int(frame.mean()) for frame in last] == [40, 20]
+    assert grey.reads == [8, 9]
+
+
+def test_light_that_does_not_fade_changes_nothing():
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 5, 7, 3), dtype=np.uint8)
+    for frame, shown in zip(pictures, Dimmed(Pictures(pictures), 0.0), strict=True):
+        np.testing.assert_array_equal(shown, frame)
+
+
+@pytest.mark.parametrize("illumination", [-0.1, 1.0, np.nan])
+def test_light_cannot_fade_by_more_than_there_is(illumination):
+    with pytest.raises(ValueError, match="illumination"):
+        Dimmed(Grey(), illumination)
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import pytest
 
 from pftrack import datasets
 from pftrack.datasets import synthetic
-from pftrack.datasets.synthetic import scene
+from pftrack.datasets.synthetic import draw_detections, scene
 
 SMALL = {"n_frames": 20, "size": (160, 120)}
 
@@ -284,3 +284,43 @@ def test_a_walker_walks_straight_across_the_picture_and_stays_in_it():
 def test_a_knob_out_of_its_range_is_refused(knobs, hint):
     with pytest.raises(ValueError, match=hint):
         scene(**{**SMALL, **knobs})
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Detections
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_detections_without_any_fault_are_the_truth():
+    film = scene(**SMALL, n_walkers=3)
+    drawn = draw_detections(film, found=1.0, error=0.0, ghosts=0.0)
+    np.testing.assert_array_equal(drawn[:, [0, 2, 3, 4, 5, 6]], film.tracks[:, [0, 2, 3, 4, 5, 6]])
+    assert (drawn[:, 1] == -1).all()
+
+
+def test_detections_are_missed_and_moved_as_often_and_as_far_as_is_said():
+    film = scene(n_frames=400, n_walkers=5)
+    n = len(film.tracks)
+    assert abs(len(draw_detections(film, found=0.7, ghosts=0.0)) / n - 0.7) < 5 * np.sqrt(0.7 * 0.3 / n)
+    steps = draw_detections(film, found=1.0, error=0.1, ghosts=0.0)[:, 2:6] - film.tracks[:, 2:6]
+    steps /= film.tracks[:, [4, 5, 4, 5]]
+    np.testing.assert_allclose(steps.std(axis=0), 0.1, rtol=5 / np.sqrt(2 * n))
+    np.testing.assert_allclose(steps.mean(axis=0), 0.0, atol=5 * 0.1 / np.sqrt(n))
+
+
+def test_false_detections_have_the_sizes_of_people_and_lie_anywhere_in_the_picture():
+    film = scene(n_frames=400, n_walkers=5)
+    false = draw_detections(film, found=0.0, error=0.0, ghosts=2.0)
+    assert abs(len(false) - 800) < 5 * np.sqrt(800)  # a Poisson number
+    assert {tuple(size) for size in false[:, 4:6]} == {tuple(size) for size in film.tracks[:, 4:6]}
+    rest = [320, 240] - false[:, 4:6]
+    places = false[:, 2:4] / rest
+    assert ((places >= 0) & (places <= 1)).all()
+    assert abs(places.mean(axis=0) - 0.5).max() < 5 / np.sqrt(12 * len(false))
+    assert len(np.unique(false[:, 0])) > 300
+
+
+def test_a_seed_gives_the_same_detections():
+    film = scene(**SMALL, n_walkers=2)
+    np.testing.assert_array_equal(draw_detections(film, seed=3), draw_detections(film, seed=3))
+    assert draw_detections(film, seed=3).tobytes() != draw_detections(film, seed=4).tobytes()
