@@ -14,10 +14,11 @@ import pandas as pd
 import pytest
 
 import pftrack
-from pftrack import datasets, detection, experiments, masks, metrics, reproduce
+from pftrack import datasets, detection, experiments, masks, metrics, multi, reproduce
 from pftrack.cli import main
 from pftrack.datasets import registry
-from pftrack.reproduce import Plan, many, rivals
+from pftrack.multi import association
+from pftrack.reproduce import Plan, crowd, many, rivals
 
 SCENE = "synthetic-occlusion"
 N_FRAMES = 70
@@ -573,17 +574,22 @@ def by_hand(name: str, film: datasets.Sequence, table: np.ndarray) -> np.ndarray
         tracker = pftrack.BagOfFeaturesParticleFilter(seed=0)
         tracker.init(frames[:5], truth[:5])
         return np.array([[track.box for track in tracker.update(frame)] for frame in frames[5:]])
-    kind = pftrack.BoostedParticleFilter if name.startswith("boosted") else pftrack.AssociationParticleFilter
-    tracker = kind(seed=0, **({"as_printed": True} if "printed" in name else {}))
-    for frame, boxes in zip(frames[:5], truth[:5], strict=True):
-        first = tracker.update(frame, [[*box, 5.0] for box in boxes])
-    assert len(first) == 2
-    known = [int(np.argmax([metrics.pairwise_overlap([track.box], [box]) for track in first])) for box in truth[4]]
+    if name.startswith("association"):
+        tracker = pftrack.AssociationParticleFilter(seed=0, as_printed="printed" in name)
+        tracker.init(frames[:5], truth[:5])
+        known = [1, 2]
+    else:
+        tracker = pftrack.BoostedParticleFilter(seed=0)
+        for frame, boxes in zip(frames[:5], truth[:5], strict=True):
+            first = tracker.update(frame, [[*box, 5.0] for box in boxes])
+        assert len(first) == 2
+        alike = metrics.pairwise_overlap(truth[4], [track.box for track in first])
+        known = [first[n].id for n in alike.argmax(axis=1)]
     boxes = []
     for t, frame in enumerate(frames[5:], start=5):
         detections = None if "AdaBoost" in name else table[table[:, 0] == t, 2:]
         found = {track.id: track.box for track in tracker.update(frame, detections)}
-        boxes.append([found.get(first[n].id, np.full(4, np.nan)) for n in known])
+        boxes.append([found.get(id, np.full(4, np.nan)) for id in known])
     return np.array(boxes)
 
 
@@ -632,3 +638,35 @@ def test_the_printed_tables_have_a_number_for_every_pedestrian_and_tracker():
     assert lengths == {"Table 3": {3}, "Table 4": {5}, "Table 5": {3}}
     assert {tuple(rows) for rows in reproduce.PRINTED.values()} == {("superpixel", "boosted-pf", "association-pf")}
     assert set(reproduce.PRINTED["Table 3"]) < set(rivals.TRACKERS)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# The association filter on whole films
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_the_association_filter_is_scored_as_by_hand(plan, monkeypatch):
+    film = pair("one")
+    film = dataclasses.replace(film, detections=datasets.synthetic.draw_detections(film))
+    monkeypatch.setattr(datasets, "load", lambda id, progress=True: film)
+    monkeypatch.setattr(crowd, "PUBLISHED_SCORE", {"one": 0.5})
+    plan = dataclasses.replace(plan, n_runs=2, followed=("one",))
+    runs, ablation = made("association", plan)
+    kinds = [("own", "default"), ("own", "as printed"), ("published", "default")]
+    assert list(zip(runs["detections"], runs["form"], strict=True)) == [kind for kind in kinds for _ in range(2)]
+    assert (runs["n_truth"] == len(film.tracks)).all()
+    for row in runs[runs["detections"] == "published"].to_dict("records"):
+        tracker = pftrack.AssociationParticleFilter(seed=row["seed"], birth_score=0.5)
+        tracks = multi.table(multi.follow(tracker, film.frames, film.detections))
+        expected = metrics.multi_target(tracks, film.tracks)
+        assert expected.n_matched > 0
+        assert [row["mota"], row["idf1"], row["n_matched"]] == pytest.approx(
+            [expected.mota, expected.idf1, expected.n_matched], abs=1e-5
+        )
+    assert ablation["left_out"].tolist() == ["nothing", *association.ADDITIONS]
+    assert (ablation["runs"] == 2).all()
+
+
+def test_one_addition_is_left_out_at_a_time():
+    for name, settings in reproduce.association_steps()[1:]:
+        assert set(association.ADDITIONS) - set(settings["additions"]) == {name}

@@ -38,7 +38,7 @@ from pftrack import motion, patches, smc
 from pftrack.checks import check_picture, check_same_size, check_seed
 from pftrack.detection import PedestrianDetector
 from pftrack.metrics import pairwise_overlap
-from pftrack.multi.base import Track, check_detections, link, stream
+from pftrack.multi.base import Track, check_detections, check_training, link, stream
 from pftrack.multi.looks import Looks, Picture
 from pftrack.multi.printed import PrintedTarget, feature_weights
 
@@ -227,6 +227,30 @@ class AssociationParticleFilter:
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []
         self._shape = self._gray = None
 
+    def init(self, frames, boxes) -> None:
+        """Learn targets that are known, instead of finding them.
+
+        Parameters
+        ----------
+        frames : sequence of ndarray, shape (H, W, 3), uint8
+            The training frames. Tracking goes on with the frame after the last.
+        boxes : array_like, shape (M, K, 4)
+            Box of each of `K` targets in each frame, NaN where it is hidden; each is seen in the last frame.
+
+        Raises
+        ------
+        ValueError
+            If there are no frames or targets, a frame or box is unusable, or a target is hidden in the last frame.
+        """
+        known = check_training(frames, boxes)
+        if not all(len(frames) - 1 in of_one for of_one in known):
+            raise ValueError("a target is hidden in the last training frame, so nobody knows where it is")
+        self._shape, self._targets, self._n_born = frames[-1].shape, [], 0
+        self._camera_shift(frames[-1])
+        picture = Picture(frames[-1])
+        for of_one in known:
+            self._start({t: of_one[t] for t in sorted(of_one)}, frames, picture, np.zeros(2))
+
     def update(self, frame: np.ndarray, detections=None) -> list[Track]:
         """Follow all targets into the next frame, the first included; take leave of some, and welcome others.
 
@@ -328,16 +352,20 @@ class AssociationParticleFilter:
         if len(self._recent) < n_needed:
             return
         for boxes in link([found for _, found in self._recent], min_frames=n_needed):
-            self._n_born += 1
-            rng = stream(self.seed, self._n_born)
-            if self.as_printed:
-                frames = [self._recent[t][0] for t in boxes]
-                newcomer = PrintedTarget(self._n_born, list(boxes.values()), frames, self, rng)
-            else:
-                newcomer = _Target(self._n_born, list(boxes.values()), picture, shift, self, rng)
-            self._targets.append(newcomer)
+            self._start(boxes, [seen for seen, _ in self._recent], picture, shift)
         kept = [target.box for target in self._targets]
         self._recent = [(seen, found[~_near(found, kept)]) for seen, found in self._recent]
+
+    def _start(self, boxes: dict[int, np.ndarray], frames, picture: Picture, shift: np.ndarray) -> None:
+        """Begin to follow somebody, who was in these boxes of the latest frames."""
+        self._n_born += 1
+        rng = stream(self.seed, self._n_born)
+        if self.as_printed:
+            of_boxes = [frames[t] for t in boxes]
+            newcomer = PrintedTarget(self._n_born, list(boxes.values()), of_boxes, self, rng)
+        else:
+            newcomer = _Target(self._n_born, list(boxes.values()), picture, shift, self, rng)
+        self._targets.append(newcomer)
 
 
 def _near(found, boxes) -> np.ndarray:

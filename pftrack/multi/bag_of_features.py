@@ -30,7 +30,7 @@ import numpy as np
 from pftrack import codebook, motion, patches, smc, superpixels
 from pftrack.checks import check_box, check_picture, check_same_size, check_seed
 from pftrack.detection import PedestrianDetector
-from pftrack.multi.base import Track, link, stream
+from pftrack.multi.base import Track, check_training, link, stream
 
 FEATURES = ("color", "texture")
 """The two kinds of patches, in the order in which everything here has them."""
@@ -186,16 +186,7 @@ class BagOfFeaturesParticleFilter:
         ValueError
             If there are no frames or targets, a frame or box is unusable, or a target is never seen.
         """
-        boxes = np.asarray(boxes, dtype=float)
-        if len(frames) == 0 or boxes.ndim != 3 or boxes.shape[::2] != (len(frames), 4) or boxes.shape[1] == 0:
-            raise ValueError(
-                f"need training frames and boxes (M, K, 4) of them, got {len(frames)} frames and boxes {boxes.shape}"
-            )
-        for frame in frames:
-            check_same_size(check_picture(frame).shape, frames[0].shape)
-        known = [{t: box for t, box in enumerate(of_one) if np.isfinite(box).all()} for of_one in boxes.swapaxes(0, 1)]
-        if not all(known):
-            raise ValueError("a target is hidden in all training frames, so nothing can be learnt of it")
+        known = check_training(frames, boxes)
         self._train(list(frames), known)
 
     def _train(self, frames: list[np.ndarray], known: list[dict[int, np.ndarray]]) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from pftrack import patches
+from pftrack.checks import check_picture, check_same_size
 from pftrack.detection import merge
 from pftrack.metrics import pairwise_overlap
 
@@ -95,6 +96,39 @@ def check_detections(detections) -> np.ndarray:
     if found.ndim != 2 or found.shape[1] != 5 or not np.isfinite(found).all() or not (found[:, 2:4] > 0).all():
         raise ValueError(f"detections must be rows x, y, w, h, score with boxes that are not empty, got {detections!r}")
     return found
+
+
+def check_training(frames, boxes) -> list[dict[int, np.ndarray]]:
+    """Return the boxes of each target in training frames, or say what is wrong with them.
+
+    Parameters
+    ----------
+    frames : sequence of ndarray, shape (H, W, 3), uint8
+        The frames.
+    boxes : array_like, shape (M, K, 4)
+        Box of each of `K` targets in each frame, NaN where it is hidden.
+
+    Returns
+    -------
+    list of dict of int to ndarray, shape (4,)
+        For each target its box in the frames in which it is seen.
+
+    Raises
+    ------
+    ValueError
+        If there are no frames or targets, a frame is unusable, or a target is never seen.
+    """
+    boxes = np.asarray(boxes, dtype=float)
+    if len(frames) == 0 or boxes.ndim != 3 or boxes.shape[::2] != (len(frames), 4) or boxes.shape[1] == 0:
+        raise ValueError(
+            f"need training frames and boxes (M, K, 4) of them, got {len(frames)} frames and boxes {boxes.shape}"
+        )
+    for frame in frames:
+        check_same_size(check_picture(frame).shape, frames[0].shape)
+    known = [{t: box for t, box in enumerate(of_one) if np.isfinite(box).all()} for of_one in boxes.swapaxes(0, 1)]
+    if not all(known):
+        raise ValueError("a target is hidden in all training frames, so nothing can be learnt of it")
+    return known
 
 
 class MultiTracker(Protocol):

@@ -31,7 +31,7 @@ from pftrack import codebook, motion, smc, superpixels
 from pftrack.multi.base import Track
 from pftrack.multi.looks import Picture, bands
 
-CLUSTER_EVERY = 10
+CLUSTER_EVERY = 25
 """Frames from one clustering of the prior knowledge to the next; it takes longer than all the rest."""
 
 

@@ -1,8 +1,9 @@
 """The comparison of Li et al. 2016, section 5.1, and of Li et al. 2012: superpixel tracking, boosted and their filters.
 
-All start from the same: those pedestrians who are seen in all of the first five frames, with their true boxes there.
-Trackers that need detections get the true boxes as such, and from then on the same table of what the library's detector
-found; the boosted particle filter runs a second time with its own detector, AdaBoost. Chapter 12 shows the results.
+All start from the same: those pedestrians who are seen in all of the first five frames, with their true boxes there, which
+the boosted particle filter gets as detections. From then on those that need detections get the same table of what the
+library's detector found; the boosted particle filter runs a second time with its own, AdaBoost. Chapter 12 shows the
+results.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import pandas as pd
 from pftrack import datasets, detection, metrics, multi
 from pftrack.adaboost import AdaBoostDetector
 from pftrack.datasets.readers import boxes_of
+from pftrack.reproduce.crowd import N_PRINTED
 from pftrack.reproduce.many import AFTER, N_TRAINING, seen_in_training, swapped
 from pftrack.reproduce.plan import Plan
 from pftrack.trackers import SuperpixelTracker
@@ -114,7 +116,7 @@ def _compare(plan: Plan, id: str, illumination: float, cascade: np.ndarray, seed
     tasks = [
         (name, settings, *about, {"HOG": found, "AdaBoost": cascade}.get(whose), seed)
         for name, (_, settings, whose) in TRACKERS.items()
-        for seed in seeds
+        for seed in (seeds[:N_PRINTED] if settings else seeds)
     ]
     rows = []
     for (name, *_, seed), tracks in zip(tasks, plan.each(_follow, tasks), strict=True):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pftrack import multi
-from pftrack.multi import Track, link, table
+from pftrack.multi import Track, base, link, table
 
 
 def found(*people, score=1.0):
@@ -80,3 +80,51 @@ def test_a_table_has_a_row_for_every_track():
     np.testing.assert_array_equal(rows[:, :2], [[0, 3], [2, 1], [2, 3]])
     np.testing.assert_array_equal(rows[0, 2:], [0, 1, 2, 3, 0.25])
     assert table([]).shape == (0, 7)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Random numbers of the targets, and detections from outside
+# ---------------------------------------------------------------------------------------------------------------------
+
+
+def test_every_target_has_a_stream_of_its_own():
+    """It is the same whoever else there is, and no two agree in any number."""
+    draws = {key: base.stream(*key).random(100) for key in [(0, 1), (0, 2), (1, 1), (1, 2), (12, 0)]}
+    for key in reversed(draws):
+        np.testing.assert_array_equal(base.stream(*key).random(100), draws[key])
+    assert len(np.unique(list(draws.values()))) == 500
+
+
+def test_a_generator_gives_its_children_in_turn():
+    generator, same = np.random.default_rng(5), np.random.default_rng(5)
+    children = [base.stream(generator, number) for number in (7, 7)]
+    expected = [np.random.default_rng(each) for each in same.bit_generator.seed_seq.spawn(2)]
+    draws = [child.random(50) for child in children]
+    np.testing.assert_array_equal(draws, [child.random(50) for child in expected])
+    assert not np.intersect1d(*draws).size
+    np.testing.assert_array_equal(generator.random(50), same.random(50))  # and draws no number of its own
+
+
+@pytest.mark.parametrize("none", [[], np.empty((0, 5)), np.empty((0, 7)), ()])
+def test_no_detections_are_none(none):
+    assert base.check_detections(none).shape == (0, 5)
+
+
+def test_detections_are_what_they_were():
+    rows = [[-5, 2, 3, 4, -0.5], [1, 2, 0.5, 1e4, 7]]
+    checked = base.check_detections(rows)
+    assert checked.dtype == float
+    np.testing.assert_array_equal(checked, rows)
+
+
+@pytest.mark.parametrize(
+    "detections",
+    [
+        [[1, 2, 3, 4]], [1, 2, 3, 4, 5], [[1, 2, 3, 4, 5, 6]], [[[1, 2, 3, 4, 5]]], 3.0,
+        [[1, 2, 0, 4, 1]], [[1, 2, 3, -4, 1]], [[1, 2, np.nan, 4, 1]], [[1, np.inf, 3, 4, 1]], [[1, 2, 3, 4, np.nan]],
+        [[1, 2, 3, 4, 1], [1, 2, 3, 0, 1]],
+    ],
+)  # fmt: skip
+def test_detections_that_are_none_are_refused(detections):
+    with pytest.raises(ValueError, match="detections must be rows"):
+        base.check_detections(detections)
