@@ -6,7 +6,7 @@ ByteTrack and 0.6 for OC-SORT, are applied to the detections' scores as these ar
 the library's trackers look at the frames too.
 
 ``pftrack.metrics.multi_target`` scores every run. TrackEval scores it again, from overlaps of its own, and must agree.
-``make bench`` runs this after ``clustering.py`` and writes ``results/association.csv``, one row a run. The time is
+``make bench`` runs this after ``clustering.py`` and writes ``results/association-peers.csv``, one row a run. The time is
 that of a frame whose detections are there, in the mean, on one thread.
 """
 
@@ -194,7 +194,7 @@ def main(path: Path, films: list[str], n_seeds: int, published: bool) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("results/association.csv"))
+    parser.add_argument("--output", type=Path, default=Path("results/association-peers.csv"))
     parser.add_argument("--films", nargs="+", choices=FILMS, default=list(FILMS), help="films to run on (all)")
     parser.add_argument("--seeds", type=int, default=1, help="runs of each of the library's trackers (1)")
     parser.add_argument("--published", action="store_true", help="also on the detections that come with a film")

@@ -21,10 +21,10 @@ PUBLISHED_SCORE = {"pets09-s2l1": 0.9, "tud-campus": 20.0}
 ABLATED = ("mota", "idf1", "hota")
 """Measures of the ablation."""
 
-N_PRINTED = 3
+N_PRINTED = 1
 """Seeds of the filter as printed, which takes twenty times as long; the default has ten."""
 
-N_ABLATED = 5
+N_ABLATED = 3
 """Seeds of the ablation."""
 
 

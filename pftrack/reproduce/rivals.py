@@ -1,9 +1,9 @@
 """The comparison of Li et al. 2016, section 5.1, and of Li et al. 2012: superpixel tracking, boosted and their filters.
 
-All start from the same: those pedestrians who are seen in all of the first five frames, with their true boxes there, which
-the boosted particle filter gets as detections. From then on those that need detections get the same table of what the
-library's detector found; the boosted particle filter runs a second time with its own, AdaBoost. Chapter 12 shows the
-results.
+All start from the same: those pedestrians who are seen in all of the first five frames, with their true boxes there,
+which the boosted particle filter gets as detections. From then on those that need detections get the same table of what
+the library's detector found; the boosted particle filter runs a second time with its own, AdaBoost. Chapter 12 shows
+the results.
 """
 
 from __future__ import annotations
