@@ -24,8 +24,8 @@ predicted, the logarithm of
 with the covariances :math:`Q` of the motion and :math:`R` of the detector. As both are Gaussian, the particles of a
 target that was found can be drawn from :math:`p(x_t \mid x_{t-1}, z_t)` itself, the optimal proposal (Doucet et al.
 2000); each is then weighted by how well *it* predicted :math:`z`, and by the likelihood of the looks where it is now.
-:data:`ADDITIONS` lists what was added, and ``results/association-ablation.csv`` has what each is worth. Chapter 11
-builds the filter.
+The particles of who is absent only move, as in section 4.3. :data:`ADDITIONS` lists what was added, and
+``results/association-ablation.csv`` has what each is worth. Chapter 11 builds the filter.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from collections.abc import Collection
 import numpy as np
 
 from pftrack import motion, patches, smc
-from pftrack.checks import check_picture, check_same_size, check_seed
+from pftrack.checks import check_box, check_picture, check_same_size, check_seed
 from pftrack.detection import PedestrianDetector
 from pftrack.metrics import pairwise_overlap
 from pftrack.multi.base import Track, check_detections, check_training, link, stream
@@ -212,7 +212,7 @@ class AssociationParticleFilter:
                 "n_particles, n_frames and n_bands must be at least 1, and remember at least n_frames, "
                 f"got {n_particles}, {n_frames}, {n_bands} and {remember}"
             )
-        if len(sigma) != 2 or not min(sigma) > 0:
+        if len(sigma) != 2 or not all(0 < each < np.inf for each in sigma):
             raise ValueError(f"sigma must be two positive numbers, of colours and of patterns, got {sigma}")
         if unknown := set(additions) - set(ADDITIONS):
             raise ValueError(f"unknown additions {sorted(unknown)}; choose from {', '.join(ADDITIONS)}")
@@ -245,7 +245,9 @@ class AssociationParticleFilter:
         known = check_training(frames, boxes)
         if not all(len(frames) - 1 in of_one for of_one in known):
             raise ValueError("a target is hidden in the last training frame, so nobody knows where it is")
-        self._shape, self._targets, self._n_born = frames[-1].shape, [], 0
+        for of_one in known:
+            check_box(of_one[len(frames) - 1], frames[-1])
+        self._shape, self._targets, self._n_born, self._recent = frames[-1].shape, [], 0, []
         self._camera_shift(frames[-1])
         picture = Picture(frames[-1])
         for of_one in known:
@@ -336,9 +338,10 @@ class AssociationParticleFilter:
         height, width = self._shape[:2]
         x, y, w, h = target.box
         center = x + w / 2
-        beyond = not -0.05 * h <= center <= width + 0.05 * h or y > height - 10 or target.feet > height + 0.4 * h
+        across = -0.05 * h <= center <= width + 0.05 * h
+        down = -0.9 * h <= y <= height - 10 and target.feet <= height + 0.4 * h
         at_the_edge = not BORDER * h <= center <= width - BORDER * h or target.feet > height - 2
-        return beyond or (at_the_edge and target.n_absent >= self.n_frames)
+        return not (across and down) or (at_the_edge and target.n_absent >= self.n_frames)
 
     def _add(self, frame: np.ndarray, picture: Picture, free: np.ndarray, shift: np.ndarray) -> None:
         """Welcome those who were seen in so many frames in a row, and were nobody known (eq. 11)."""
@@ -353,7 +356,7 @@ class AssociationParticleFilter:
             return
         for boxes in link([found for _, found in self._recent], min_frames=n_needed):
             self._start(boxes, [seen for seen, _ in self._recent], picture, shift)
-        kept = [target.box for target in self._targets]
+        kept = [target.box for target in self._targets if not target.missing]
         self._recent = [(seen, found[~_near(found, kept)]) for seen, found in self._recent]
 
     def _start(self, boxes: dict[int, np.ndarray], frames, picture: Picture, shift: np.ndarray) -> None:
@@ -364,7 +367,7 @@ class AssociationParticleFilter:
             of_boxes = [frames[t] for t in boxes]
             newcomer = PrintedTarget(self._n_born, list(boxes.values()), of_boxes, self, rng)
         else:
-            newcomer = _Target(self._n_born, list(boxes.values()), picture, shift, self, rng)
+            newcomer = _Target(self._n_born, boxes, picture, shift, self, rng)
         self._targets.append(newcomer)
 
 
@@ -388,13 +391,14 @@ def _parts(found: np.ndarray) -> np.ndarray:
 class _Target:
     """Somebody who is followed: looks, and particles ``[x, y, w, h, dx/dt, dy/dt]`` with `x` and `y` of the centre."""
 
-    def __init__(self, number: int, boxes, picture: Picture, shift, settings: AssociationParticleFilter, rng):
+    def __init__(self, number: int, boxes: dict[int, np.ndarray], picture: Picture, shift, settings, rng):
         self.settings, self.rng = settings, rng
         self.additions = settings.additions
-        self.box = np.array(boxes[-1], dtype=float)
+        first, last = min(boxes), max(boxes)
+        self.box = np.array(boxes[last], dtype=float)
         x, y, w, h = self.box
-        middles = [[left + wide / 2, top + high / 2] for left, top, wide, high in boxes]
-        velocity = np.mean(np.diff(middles, axis=0), axis=0) - shift if len(boxes) > 1 else np.zeros(2)
+        moved = (boxes[last] - boxes[first])[:2] + (boxes[last] - boxes[first])[2:] / 2
+        velocity = moved / (last - first) - shift if last > first else np.zeros(2)
         spread = [DETECTION_NOISE[0] * h] * 2 + [0, 0] + [START_SPEED * h] * 2
         start = [x + w / 2, y + h / 2, w, h, *velocity]
         self.states = start + spread * rng.standard_normal((settings.n_particles, 6))
@@ -478,7 +482,8 @@ class _Target:
                 np.exp(-(1 - similarities) / (2 * np.reshape(self.settings.sigma, (2, 1)) ** 2))
             )
         looks = self._log_likelihood(similarities)
-        log_weights += seen * looks + (1 - seen) * (self.usual - HIDDEN_LIKE)
+        if observation is not None or self.n_absent == 0:  # who is absent only moves (section 4.3)
+            log_weights += seen * looks + (1 - seen) * (self.usual - HIDDEN_LIKE)
         weights = smc.normalize(log_weights)
         x, y, w, h, _, _ = smc.weighted_mean(self.states, weights)
         self.box = np.array([x - w / 2, y - h / 2, w, h])
