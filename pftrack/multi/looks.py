@@ -36,7 +36,7 @@ COVERED = (color.N_BINS - 1, texture.N_PATTERNS)
 brightest of its hue, gives its own to the next darker one."""
 
 MIDDLE = 0.6
-"""Share of a box's width that is looked at: people do not fill their boxes."""
+"""Share of a box's width that is looked at, for people do not fill their boxes."""
 
 BODY = (0.76, 0.95)
 """Share of a box's width and height, from the feet, that hides what is behind it."""

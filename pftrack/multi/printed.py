@@ -108,7 +108,7 @@ class PrintedTarget:
     """Boxes drawn from the confidence map. *Not printed.*"""
 
     NOISE = (0.05, 0.02, 0.01, 0.01)
-    """Standard deviations of eq. 4: of the centre relative to the height, of the size to itself. *Not printed.*"""
+    """Standard deviations of eq. 4, of the centre relative to the height and of the size to itself. *Not printed.*"""
 
     LEAST = 0.05
     """What is "approximately zero", and the threshold TH of Algorithm 1. *Not printed.*"""

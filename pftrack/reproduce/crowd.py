@@ -25,9 +25,9 @@ N_PRINTED = 1
 """Seeds of the filter as printed; the default has ten."""
 
 PRINTED_FRAMES = 120
-"""Frames of a film that the filter as printed sees: nobody ever leaves it, so that each frame takes longer."""
+"""Frames of a film that the filter as printed sees, for nobody ever leaves it, and each frame takes longer."""
 
-N_ABLATED = 3
+N_ABLATED = 2
 """Seeds of the ablation."""
 
 
@@ -47,8 +47,8 @@ def association(plan: Plan) -> list[Path]:
     """Score the association filter on whole films: MOTA, IDF1, HOTA and what they are made of.
 
     ``association-runs.csv`` has one row for each film, form (``default`` or ``as printed``) and seed, with all measures
-    of :class:`pftrack.metrics.MultiTargetScore`, over all frames, or as printed over the first 120; on the detections
-    of our detector (``own``), and in the default form on those that come with a film (``published``).
+    of :class:`pftrack.metrics.many.MultiTargetScore`, over all frames, or as printed over the first 120; on the
+    detections of our detector (``own``), and in the default form on those that come with a film (``published``).
     ``association-ablation.csv`` has one row for each addition that is left out, and film.
     """
     n_seeds = {form: min(plan.n_runs, N_PRINTED if settings else 10) for form, settings in FORMS.items()}

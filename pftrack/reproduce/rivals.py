@@ -68,7 +68,7 @@ TRACKERS = {
     "association-pf": (multi.AssociationParticleFilter, {}, "HOG"),
     "association-pf (as printed)": (multi.AssociationParticleFilter, {"as_printed": True}, "HOG"),
 }
-"""By name: the class of a tracker, its settings, and whose detections it gets after the training frames, if any."""
+"""What is compared. Each name stands for a class, its settings and whose detections it gets after the training."""
 
 DIMMED = 0.6
 """Share of the light that is gone by the last frame of the first film, when it is shown a second time."""
@@ -77,10 +77,10 @@ DRAWN = "synthetic-dusk"
 """The scene that ends the comparison. The detector finds nobody in it, so detections are drawn at random."""
 
 AT_MOST = {"pets09-s2l1": 210}
-"""Frames of a film of which no more are used: as many as the sequence that Li et al. 2016 took from PETS has."""
+"""Most frames of a film that are used. The sequence that Li et al. 2016 took from PETS has as many."""
 
 CERTAIN = 5.0
-"""Score of the true boxes, where they are given as detections: as sure as the detector is of its best."""
+"""Score of true boxes that are given as detections. The detector is as sure of its best."""
 
 
 def comparison(plan: Plan) -> list[Path]:
