@@ -6,8 +6,8 @@ ByteTrack and 0.6 for OC-SORT, are applied to the detections' scores as these ar
 the library's trackers look at the frames too.
 
 ``pftrack.metrics.multi_target`` scores every run. TrackEval scores it again, from overlaps of its own, and must agree.
-``make bench`` runs this after ``clustering.py`` and writes ``results/association-peers.csv``, one row a run. The time is
-that of a frame whose detections are there, in the mean, on one thread.
+``make bench`` runs this after ``clustering.py`` and writes ``results/association-peers.csv``, one row a run. The time
+is that of a frame whose detections are there, in the mean, on one thread.
 """
 
 import argparse
