@@ -97,7 +97,8 @@ START_SPEED = 0.03
 """Standard deviation of the velocity of somebody new, in heights a frame."""
 
 FADING = 0.9
-"""What is left of a velocity after a frame in which nothing of the target was found, once there were three."""
+"""What is left of a velocity after a frame without a detection, from the fifth on, or where little of the target is
+seen."""
 
 LOOKS_COUNT = 2.0
 """Weight of the logarithm of the looks' likelihood in the incidence matrix, against that of the place."""
@@ -112,7 +113,7 @@ SEEN_WELL = 0.8
 """Share of a target that must be seen for anything to be learnt from it."""
 
 SEEN_AT_ALL = 0.35
-"""Share of a target below which not being found says nothing about it."""
+"""Share of a target that must be seen for its looks to confirm it; below, a box without a detection is *held*."""
 
 HIDDEN_LIKE = 0.5
 """By how much what is hidden is less likely, in the logarithm, than what looks as usual."""
@@ -124,7 +125,7 @@ TRUST = 0.25
 """Frames for which a target is believed without a detection, for each in which it was detected."""
 
 AT_MOST = 18
-"""The same, whatever the number of detections."""
+"""Most frames for which a target is believed without a detection."""
 
 BORDER = 0.3
 """Distance from the sides of the picture, in heights, in which who is not found has left."""
@@ -133,7 +134,7 @@ INSIDE = 0.6
 """Share of a detection that must lie in another box to be a part of it."""
 
 TALLER = 1.25
-"""By how much that other box must be taller, and by half of which its score may be lower."""
+"""By which factor that other box must be taller; its score may be half as high."""
 
 
 class AssociationParticleFilter:
