@@ -651,8 +651,9 @@ def test_the_association_filter_is_scored_as_by_hand(plan, monkeypatch):
     monkeypatch.setattr(crowd, "PUBLISHED_SCORE", {"one": 0.5})
     plan = dataclasses.replace(plan, n_runs=2, followed=("one",))
     runs, ablation = made("association", plan)
-    kinds = [("own", "default"), ("own", "as printed"), ("published", "default")]
-    assert list(zip(runs["detections"], runs["form"], strict=True)) == [kind for kind in kinds for _ in range(2)]
+    n_seeds = {("own", "default"): 2, ("own", "as printed"): crowd.N_PRINTED, ("published", "default"): 2}
+    kinds = [kind for kind, n in n_seeds.items() for _ in range(n)]
+    assert list(zip(runs["detections"], runs["form"], strict=True)) == kinds
     assert (runs["n_truth"] == len(film.tracks)).all()
     for row in runs[runs["detections"] == "published"].to_dict("records"):
         tracker = pftrack.AssociationParticleFilter(seed=row["seed"], birth_score=0.5)
