@@ -94,6 +94,34 @@ def check_box(box, frame: np.ndarray) -> np.ndarray:
     return box
 
 
+def is_shown(box, frame: np.ndarray) -> bool:
+    """Tell whether a frame shows enough of a box to measure it, as :func:`check_box` demands.
+
+    Parameters
+    ----------
+    box : array_like, shape (4,)
+        ``(x, y, w, h)`` in pixels.
+    frame : ndarray, shape (H, W, 3), uint8
+        The frame.
+
+    Returns
+    -------
+    bool
+        False where :func:`check_box` would raise.
+
+    Examples
+    --------
+    >>> frame = np.zeros((100, 100, 3), dtype=np.uint8)
+    >>> is_shown((10, 10, 20, 40), frame), is_shown((200, 10, 20, 40), frame)
+    (True, False)
+    """
+    try:
+        check_box(box, frame)
+    except ValueError:
+        return False
+    return True
+
+
 def check_seed(seed) -> None:
     """Make sure that a seed is one.
 

@@ -23,7 +23,7 @@ are put together to tracks, :math:`\text{AssA}`, averaged over 19 thresholds of 
 
 The conventions are those of TrackEval, the code of the MOTChallenge, and named where they matter. Tables are those of
 :mod:`pftrack.datasets.readers`. All boxes given count: what should not, such as the boxes that a truth flags as not to
-be scored, must be left out before. Chapters 11 and 12 use the measures.
+be scored, must be left out before. Chapter 11 uses the measures.
 """
 
 from __future__ import annotations

@@ -136,6 +136,12 @@ INSIDE = 0.6
 TALLER = 1.25
 """By which factor that other box must be taller; its score may be half as high."""
 
+SAME = 0.3
+"""Overlap from which two boxes mean the same person."""
+
+TAKEN = 0.4
+"""Overlap with somebody who is followed, above which a detection is nobody new."""
+
 
 class AssociationParticleFilter:
     """Follow pedestrians who come and go, by associating detections with particles (Li et al. 2016).
@@ -252,7 +258,7 @@ class AssociationParticleFilter:
         self._camera_shift(frames[-1])
         picture = Picture(frames[-1])
         for of_one in known:
-            self._start({t: of_one[t] for t in sorted(of_one)}, frames, picture, np.zeros(2))
+            self._start(of_one, frames, picture, np.zeros(2))
 
     def update(self, frame: np.ndarray, detections=None) -> list[Track]:
         """Follow all targets into the next frame, the first included; take leave of some, and welcome others.
@@ -308,7 +314,7 @@ class AssociationParticleFilter:
         if not self.as_printed:
             return found
         known = np.array([box for each in self._targets if (box := each.observe(frame)) is not None]).reshape(-1, 5)
-        new = pairwise_overlap(found[:, :4], known[:, :4]).max(axis=1, initial=0) < 0.3
+        new = pairwise_overlap(found[:, :4], known[:, :4]).max(axis=1, initial=0) < SAME
         return np.concatenate([known, found[new]])
 
     def _associate(self, picture: Picture, observations: np.ndarray) -> dict[int, int]:
@@ -348,7 +354,7 @@ class AssociationParticleFilter:
         """Welcome those who were seen in so many frames in a row, and were nobody known (eq. 11)."""
         free = free[free[:, 4] >= self.birth_score]
         known = np.array([target.box for target in self._targets if not target.missing]).reshape(-1, 4)
-        taken = pairwise_overlap(free[:, :4], known).max(axis=1, initial=0) > 0.4
+        taken = pairwise_overlap(free[:, :4], known).max(axis=1, initial=0) > TAKEN
         if "parts" in self.additions:
             taken |= _shares_inside(free[:, :4], known).max(axis=1, initial=0) > INSIDE
         n_needed = PrintedTarget.N_TRAINING if self.as_printed and not self._targets else self.n_frames
@@ -373,7 +379,7 @@ class AssociationParticleFilter:
 
 
 def _near(found, boxes) -> np.ndarray:
-    return pairwise_overlap(found[:, :4], np.reshape(boxes, (-1, 4))).max(axis=1, initial=0) > 0.3
+    return pairwise_overlap(found[:, :4], np.reshape(boxes, (-1, 4))).max(axis=1, initial=0) > SAME
 
 
 def _shares_inside(boxes, others) -> np.ndarray:
@@ -465,10 +471,13 @@ class _Target:
             scores[i] += constant + smc.log_sum_exp(-0.5 * squares) - np.log(len(squares))
         return scores
 
+    def _log_similarities(self, similarities: np.ndarray) -> np.ndarray:
+        """Return the logarithm of eq. 7 for both features; the squared distance is one less the coefficient."""
+        return -(1 - similarities) / (2 * np.reshape(self.settings.sigma, (2, 1)) ** 2)
+
     def _log_likelihood(self, similarities: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the looks' likelihood (eq. 7, and eq. 8 where there is no product)."""
-        sigma = np.reshape(self.settings.sigma, (2, 1))
-        log_each = -(1 - similarities) / (2 * sigma**2)
+        """Return the logarithm of the looks' likelihood: the product over features, or the sum of eq. 8."""
+        log_each = self._log_similarities(similarities)
         if "product" in self.additions:
             return log_each.sum(axis=0)
         with np.errstate(divide="ignore"):
@@ -479,9 +488,7 @@ class _Target:
         log_weights = self._draw(observation)
         similarities, seen = self.looks.similarities(picture, self._boxes())
         if "product" not in self.additions:
-            self.shares = feature_weights(
-                np.exp(-(1 - similarities) / (2 * np.reshape(self.settings.sigma, (2, 1)) ** 2))
-            )
+            self.shares = feature_weights(np.exp(self._log_similarities(similarities)))
         looks = self._log_likelihood(similarities)
         if observation is not None or self.n_absent == 0:  # who is absent only moves (section 4.3)
             log_weights += seen * looks + (1 - seen) * (self.usual - HIDDEN_LIKE)

@@ -28,7 +28,7 @@ import math
 import numpy as np
 
 from pftrack import codebook, motion, patches, smc, superpixels
-from pftrack.checks import check_box, check_picture, check_same_size, check_seed
+from pftrack.checks import check_box, check_picture, check_same_size, check_seed, is_shown
 from pftrack.detection import PedestrianDetector
 from pftrack.multi.base import Track, check_training, link, stream
 
@@ -244,7 +244,7 @@ class BagOfFeaturesParticleFilter:
             return []
         frames, detections = zip(*self._training, strict=True)
         known = link(detections, min_frames=math.ceil(FOUND_IN * self.n_training))
-        usable = [target for target in known if all(_shown(box, frame) for box in target.values())]
+        usable = [target for target in known if all(is_shown(box, frame) for box in target.values())]
         if not usable:
             return []
         self._train(list(frames), usable)
@@ -256,15 +256,6 @@ def _middle(box) -> np.ndarray:
     """Return the part of a box that a person fills."""
     x, y, w, h = box
     return np.array([x + 0.1 * w, y, 0.8 * w, h])
-
-
-def _shown(box, frame) -> bool:
-    """Tell whether a frame shows enough of a box to learn from it."""
-    try:
-        check_box(box, frame)
-    except ValueError:
-        return False
-    return True
 
 
 class _Target:

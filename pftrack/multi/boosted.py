@@ -33,7 +33,7 @@ looks, but not what it believes:
     \tilde w_t^{(i)} = w_{t-1}^{(i)}\,
         \frac{p(y_t \mid x_t^{(i)})\, p(x_t^{(i)} \mid x_{t-1}^{(i)})}{q_B(x_t^{(i)} \mid x_{t-1}^{(i)}, y_t)} .
 
-Detections that no component explains start new ones. Chapter 12 compares the filter with the others.
+Detections that no component explains start new ones. ``pftrack reproduce comparison`` compares.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ import numpy as np
 
 from pftrack import color, kernels, smc
 from pftrack.adaboost import AdaBoostDetector
-from pftrack.checks import check_box, check_picture, check_same_size, check_seed
+from pftrack.checks import check_picture, check_same_size, check_seed, is_shown
 from pftrack.detection import merge
 from pftrack.metrics import pairwise_overlap
 from pftrack.multi.base import Track, check_detections, stream
@@ -357,7 +357,7 @@ class BoostedParticleFilter:
     def _bury(self, frame) -> None:
         """End components that no detection was near for long, or that have left the frame."""
         self._components = [
-            each for each in self._components if each.n_unsupported < self.patience and _shown(each.track.box, frame)
+            each for each in self._components if each.n_unsupported < self.patience and is_shown(each.track.box, frame)
         ]
         if self._components:
             self._set_shares(update_shares([each.log_share for each in self._components], 0.0))
@@ -366,7 +366,7 @@ class BoostedParticleFilter:
         """Start a component with each detection that none explains; all newcomers get an average share."""
         boxes, _, _ = merge(found, np.ones(len(found)), overlap=self.min_overlap)
         for box in boxes:
-            if _shown(box, frame):
+            if is_shown(box, frame):
                 self._n_born += 1
                 newcomer = _Component(self._n_born, box, bins, self)
                 self._components.append(newcomer)
@@ -440,12 +440,3 @@ def _three(given, name: str) -> np.ndarray:
     if given.shape != (3,) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be three finite numbers, of x, y and scale, got {given.tolist()}")
     return given
-
-
-def _shown(box, frame) -> bool:
-    """Tell whether a frame shows enough of a box to measure it."""
-    try:
-        check_box(box, frame)
-    except ValueError:
-        return False
-    return True

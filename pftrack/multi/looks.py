@@ -2,7 +2,8 @@ r"""What targets look like, and how much a box looks like one, where somebody ma
 
 A target's looks are histograms of its colours and of its patterns (Li et al. 2016, section 4.2.1), two features that
 make up for each other: colour tells a red coat from a blue one in any posture, texture a striped shirt from a plain
-one in any light. Three things are added, each of which chapter 11 shows to be needed:
+one in any light. Three things are added; what the last two are worth is in
+``results/association-ablation.csv``, and on the films there it is little:
 
 - *bands*. A box is divided into bands of equal height, for one histogram cannot tell a white shirt over black
   trousers from the reverse;

@@ -3,7 +3,7 @@
 Each item of :data:`ITEMS` takes a :class:`~pftrack.reproduce.plan.Plan` and writes one or two files below
 ``results/``; ``pftrack reproduce`` runs them. The files are plain CSV under lines ``# key: value`` that say the
 settings, versions and machine; :func:`~pftrack.reproduce.plan.read` gives both. What has been computed is kept in the
-user's cache, so an interrupted item goes on where it stopped, and items share their runs. Chapters 6 to 12 show the
+user's cache, so an interrupted item goes on where it stopped, and items share their runs. Chapters 6 to 11 show the
 files and re-run a part of them.
 
 In the items of one pedestrian (:mod:`pftrack.reproduce.one`) overlaps and hits are given twice, over ``all`` frames, a

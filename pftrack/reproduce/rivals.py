@@ -2,8 +2,7 @@
 
 All start from the same: those pedestrians who are seen in all of the first five frames, with their true boxes there,
 which the boosted particle filter gets as detections. From then on those that need detections get the same table of what
-the library's detector found; the boosted particle filter runs a second time with its own, AdaBoost. Chapter 12 shows
-the results.
+the library's detector found; the boosted particle filter runs a second time with its own, AdaBoost.
 """
 
 from __future__ import annotations

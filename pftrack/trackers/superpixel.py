@@ -24,7 +24,7 @@ The target is severely occluded where even the best candidate shows hardly anyth
 where the target was last seen, and nothing is learnt. Else the frame joins a window of the latest 15, from which the
 clusters are made anew every 10 frames.
 
-Where the paper is silent, its authors' code (``huchuanlu/11_1``) speaks. Chapter 12 compares.
+Where the paper is silent, its authors' code (``huchuanlu/11_1``) speaks.
 """
 
 from __future__ import annotations
