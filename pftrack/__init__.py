@@ -13,6 +13,7 @@ The library behind the book. A tracker is started on the first frame and updated
 from pftrack import color, datasets, detection, metrics, motion, multi, smc
 from pftrack.detection import PedestrianDetector
 from pftrack.multi import AssociationParticleFilter, BagOfFeaturesParticleFilter, BoostedParticleFilter, Track
+from pftrack.sliders import Slider, explore
 from pftrack.trackers import (
     CamShiftTracker,
     ColorParticleFilter,
@@ -36,11 +37,13 @@ __all__ = [
     "MeanShiftTracker",
     "PedestrianDetector",
     "RobustParticleFilter",
+    "Slider",
     "SuperpixelTracker",
     "Track",
     "color",
     "datasets",
     "detection",
+    "explore",
     "follow",
     "metrics",
     "motion",

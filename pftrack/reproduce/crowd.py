@@ -21,13 +21,13 @@ PUBLISHED_SCORE = {"pets09-s2l1": 0.9, "tud-campus": 20.0}
 ABLATED = ("mota", "idf1", "hota")
 """Measures of the ablation."""
 
-N_PRINTED = 1
+N_PRINTED = 3
 """Seeds of the filter as printed; the default has ten."""
 
 PRINTED_FRAMES = 120
 """Frames of a film that the filter as printed sees, for nobody ever leaves it, and each frame takes longer."""
 
-N_ABLATED = 2
+N_ABLATED = 5
 """Seeds of the ablation."""
 
 
