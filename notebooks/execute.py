@@ -2,12 +2,13 @@
 
 What differs from run to run without meaning anything (times, the kernel's version) is stripped, so that a chapter
 changes in git only when its content does. Pictures are stored with at most 256 colours, a third of their weight. A
-chapter that fails is left as it was. The picture of the tracker at work, which the README and the first page show, is
-taken from its chapter.
+chapter that fails is left as it was. The picture and the film of the tracker at work, which the README and the first page
+show, are taken from their chapter.
 """
 
 import base64
 import io
+import re
 import sys
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from tqdm import tqdm
 from pftrack.files import replacing
 
 HERE = Path(__file__).parent
+STATIC = HERE.parent / "book" / "_static"
 PICTURE = "owczarek-2015-fig-4"
+FILM = "05_color_particle_filter"
 
 
 def lighter(png: str) -> str:
@@ -45,9 +48,14 @@ def execute(path: Path) -> None:
     with replacing(path) as temporary:
         nbformat.write(notebook, temporary)
     for cell in notebook.cells:
-        if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == PICTURE:
-            png = next(output.data["image/png"] for output in cell.outputs if "image/png" in output.get("data", {}))
-            (HERE.parent / "book" / "_static" / "tracker.png").write_bytes(base64.b64decode(png))
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == PICTURE and "image/png" in data:
+                (STATIC / "tracker.png").write_bytes(base64.b64decode(data["image/png"]))
+            if path.stem == FILM and "<video" in data.get("text/html", ""):
+                for kind, name in (("video/mp4", "tracker.mp4"), ("image/jpeg", "tracker.jpg")):
+                    content = re.search(rf'"data:{kind};base64,([^"]*)"', data["text/html"])[1]
+                    (STATIC / name).write_bytes(base64.b64decode(content))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ has a kernel gets any value in between from ``.live()``, which calls the same fu
 from __future__ import annotations
 
 import base64
+import functools
 import html
 import inspect
 import itertools
@@ -76,8 +77,12 @@ class Slider:
     start: object = None
 
     def __post_init__(self):
-        values = list(self.values)
-        if len(values) < 2 or len(set(values)) < len(values):
+        try:
+            values = [each.item() if isinstance(each, np.generic) else each for each in self.values]
+            different = len(set(values))
+        except TypeError:
+            values, different = self.values, 0
+        if different < 2 or different < len(values):
             raise ValueError(f"the slider {self.label!r} needs at least two different values, got {values}")
         if self.start is not None and self.start not in values:
             raise ValueError(f"the slider {self.label!r} cannot start at {self.start!r}; its values are {values}")
@@ -94,8 +99,8 @@ class Slider:
         return 0 if self.start is None else self.values.index(self.start)
 
     def text(self, value) -> str:
-        """Return a value as it is shown, broken numbers to four digits, with the unit."""
-        return f"{f'{value:.4g}' if isinstance(value, float) else value} {self.unit}".strip()
+        """Return a value as it is shown, broken numbers to six digits, with the unit."""
+        return f"{f'{value:g}' if isinstance(value, float) else value} {self.unit}".strip()
 
     def control(self):
         """Return the slider of ipywidgets for any value between the smallest and the largest."""
@@ -108,12 +113,15 @@ class Slider:
             "layout": {"width": "95%"},
             "continuous_update": False,
         }
-        value, low, high = self.values[self.first], min(self.values), max(self.values)
+        value = self.values[self.first]
+        if not kinds <= {int, float}:
+            options = list(zip(self.texts, self.values, strict=True))
+            return ipywidgets.SelectionSlider(options=options, value=value, **about)
+        low, high = min(self.values), max(self.values)
         if kinds == {int}:
             return ipywidgets.IntSlider(value, low, high, **about)
-        if kinds <= {int, float}:
-            return ipywidgets.FloatSlider(value, min=low, max=high, step=(high - low) / 100, **about)
-        return ipywidgets.SelectionSlider(options=list(zip(self.texts, self.values, strict=True)), value=value, **about)
+        step = (high - low) / 100
+        return ipywidgets.FloatSlider(value, min=low, max=high, step=step, readout_format=".4g", **about)
 
 
 class Explorer:
@@ -147,7 +155,8 @@ class Explorer:
         """Return the picture for given values as a file, what it shows in words, and its width and height."""
         picture, words = _pixels(self.fn(**values))
         at = ", ".join(f"{slider.label} {slider.text(values[name])}" for name, slider in self.sliders.items())
-        alt = f"{self.caption} {at[0].upper()}{at[1:]}{f': {words}' if words else ''}"
+        at = at[0].upper() + at[1:] if at[0].isascii() else at  # Σ is not σ
+        alt = f"{self.caption} {at}{f': {words}' if words else ''}"
         return _webp(picture), alt if alt.endswith((".", "?", "!")) else f"{alt}.", picture.shape[1::-1]
 
     def __repr__(self) -> str:
@@ -167,9 +176,9 @@ class Explorer:
             f'<figure class="pftrack-explore" style="margin:1em 0;max-width:{self.width}px">'
             f'<img src="{first}" alt="{alt}" width="{self.width}" height="{self.height}" '
             f'style="width:100%;height:auto">{controls}'
-            f"<figcaption>{html.escape(self.caption)}"
+            f'<script type="application/json">{data}</script><figcaption>{html.escape(self.caption)}'
             "<noscript> The slider needs JavaScript; this is the picture it begins with.</noscript></figcaption>"
-            f'<script type="application/json">{data}</script></figure>'
+            "</figure>"
         )
 
     def live(self):
@@ -204,7 +213,7 @@ def explore(fn: Callable, **values: Slider | Sequence) -> Explorer:
     fn : callable
         Takes one keyword argument for each slider, and returns a Matplotlib figure, or a picture of shape (H, W, 3),
         uint8, in BGR order; the picture may come in a tuple with a sentence that says what it shows. Of a figure the
-        titles say it. The first sentence of the function's docstring is the caption. Whatever in it is random takes a
+        titles say it. The first paragraph of the function's docstring is the caption. Whatever in it is random takes a
         seed, so that the same value shows the same picture.
     **values : Slider or sequence
         For each argument its values; a plain sequence is labelled with the argument's name.
@@ -252,29 +261,39 @@ def explore(fn: Callable, **values: Slider | Sequence) -> Explorer:
 
 def _caption(fn: Callable) -> str:
     """Return the first paragraph of a function's docstring."""
-    words = (inspect.getdoc(fn) or "").split("\n\n")[0]
+    while isinstance(fn, functools.partial):
+        fn = fn.func
+    words = " ".join((inspect.getdoc(fn) or "").split("\n\n")[0].split())
     if not words:
-        raise ValueError("the function needs a docstring; its first sentence is the caption of the pictures")
-    return " ".join(words.split())
+        raise ValueError("the function needs a docstring; its first paragraph is the caption of the pictures")
+    return words
 
 
 def _pixels(result) -> tuple[np.ndarray, str]:
     """Return what a function drew as a BGR picture, and what it shows in words."""
-    picture, words = result if isinstance(result, tuple) else (result, None)
-    if not hasattr(picture, "savefig"):
-        return check_picture(picture), words or ""
+    picture, words = result if isinstance(result, tuple) and len(result) == 2 else (result, "")
+    if not isinstance(words, str) or not (isinstance(picture, np.ndarray) or hasattr(picture, "savefig")):
+        raise ValueError(
+            "the function must return a Matplotlib figure, or a picture, alone or with a sentence that says what it "
+            f"shows; got {type(result).__name__}"
+        )
+    if isinstance(picture, np.ndarray):
+        return check_picture(picture), words
     import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    picture.canvas.draw()
-    pixels = cv2.cvtColor(np.asarray(picture.canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
-    titles = [picture.get_suptitle(), *(ax.get_title(loc) for ax in picture.axes for loc in ("left", "center"))]
+    canvas = FigureCanvasAgg(picture)
+    canvas.draw()
+    pixels = cv2.cvtColor(np.asarray(canvas.buffer_rgba()), cv2.COLOR_RGBA2BGR)
+    places = ("left", "center", "right")
+    titles = [picture.get_suptitle(), *(ax.get_title(place) for ax in picture.axes for place in places)]
     plt.close(picture)
     return pixels, words or "; ".join(" ".join(title.split()) for title in titles if title)
 
 
 def _webp(picture: np.ndarray) -> bytes:
     """Encode a picture without losses, or with them where that is smaller, as it is for photographs."""
-    files = [cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, q])[1].tobytes() for q in (QUALITY, 101)]
+    files = [cv2.imencode(".webp", picture, [cv2.IMWRITE_WEBP_QUALITY, q])[1].tobytes() for q in (101, QUALITY)]
     return min(files, key=len)
 
 
@@ -285,11 +304,11 @@ def _address(picture: bytes) -> str:
 
 def _control(slider: Slider) -> str:
     """Return a slider as HTML: what it is called, the handle and the value."""
-    label, text = html.escape(slider.label), html.escape(slider.texts[slider.first], quote=True)
+    label, text = (html.escape(each, quote=True) for each in (slider.label, slider.texts[slider.first]))
     return (
-        '<label style="display:grid;grid-template-columns:1fr auto;gap:0 1em;margin:.3em 0">'
+        '<div style="display:grid;grid-template-columns:1fr auto;gap:0 1em;margin:.3em 0">'
         f'<span>{label}</span><output style="font-variant-numeric:tabular-nums">{text}</output>'
         f'<input type="range" min="0" max="{len(slider.values) - 1}" step="1" value="{slider.first}" '
-        f'aria-valuetext="{text}" autocomplete="off" style="grid-column:1/-1;width:100%;height:2.5em;margin:0" '
-        f'oninput="{SHOW}"></label>'
+        f'aria-label="{label}" aria-valuetext="{text}" autocomplete="off" '
+        f'style="grid-column:1/-1;width:100%;height:2.5em;margin:0" oninput="{SHOW}"></div>'
     )
