@@ -16,7 +16,11 @@ from pftrack import datasets
 @cache
 def missing_footage(notebook: Path) -> str | None:
     """Return why a chapter cannot run, or None if all it needs is here (after downloading what can be downloaded)."""
-    for id in json.loads(notebook.read_text(encoding="utf-8"))["metadata"].get("pftrack", {}).get("datasets", []):
+    for id in (
+        json.loads(notebook.read_text(encoding="utf-8"))["metadata"]
+        .get("pftrack", {})
+        .get("datasets", [])
+    ):
         try:
             datasets.load(id, progress=False)
         except (FileNotFoundError, ValueError) as error:

@@ -310,5 +310,6 @@ def _control(slider: Slider) -> str:
         f'<span>{label}</span><output style="font-variant-numeric:tabular-nums">{text}</output>'
         f'<input type="range" min="0" max="{len(slider.values) - 1}" step="1" value="{slider.first}" '
         f'aria-label="{label}" aria-valuetext="{text}" autocomplete="off" '
+        'data-lm-suppress-shortcuts="true" '  # else JupyterLab takes the arrow keys
         f'style="grid-column:1/-1;width:100%;height:2.5em;margin:0" oninput="{SHOW}"></div>'
     )

@@ -175,6 +175,9 @@ class AssociationParticleFilter:
     ----------
     incidence : ndarray, shape (F, N)
         The incidence matrix of the latest frame: one row for each observation, one column for each target.
+    targets : list
+        Everybody that the filter remembers, those who are missing too; ``track`` is the latest of each. In the order
+        of the columns while the frame was taken in; those who have left and come since change the list at its end.
 
     Raises
     ------
@@ -230,7 +233,7 @@ class AssociationParticleFilter:
         self.sigma, self.n_bands = tuple(sigma), n_bands
         self.detector = PedestrianDetector() if detector is None else detector
         self.incidence = np.empty((0, 0))
-        self._targets, self._n_born = [], 0
+        self.targets, self._n_born = [], 0
         self._recent: list[tuple[np.ndarray, np.ndarray]] = []
         self._shape = self._gray = None
 
@@ -254,7 +257,7 @@ class AssociationParticleFilter:
             raise ValueError("a target is hidden in the last training frame, so nobody knows where it is")
         for of_one in known:
             check_box(of_one[len(frames) - 1], frames[-1])
-        self._shape, self._targets, self._n_born, self._recent = frames[-1].shape, [], 0, []
+        self._shape, self.targets, self._n_born, self._recent = frames[-1].shape, [], 0, []
         self._camera_shift(frames[-1])
         picture = Picture(frames[-1])
         for of_one in known:
@@ -286,19 +289,19 @@ class AssociationParticleFilter:
         shift, picture = self._camera_shift(frame), Picture(frame)
         if "parts" in self.additions:
             found = found[~_parts(found)]
-        for target in self._targets:
+        for target in self.targets:
             target.predict(shift)
         observations = self._observe(frame, found)
         owners = self._associate(picture, observations)
-        nearest_first = sorted(range(len(self._targets)), key=lambda j: -self._targets[j].feet)
-        for target, i in [(self._targets[j], owners.get(j)) for j in nearest_first]:
+        nearest_first = sorted(range(len(self.targets)), key=lambda j: -self.targets[j].feet)
+        for target, i in [(self.targets[j], owners.get(j)) for j in nearest_first]:
             target.update(picture, None if i is None else observations[i])
             if "mutual occlusion" in self.additions and not target.missing:
                 picture.cover(target.box)
         self._remove()
         free = np.setdiff1d(np.arange(len(observations)), list(owners.values()))
         self._add(frame, picture, observations[free], shift)
-        return [target.track for target in self._targets if not target.missing]
+        return [target.track for target in self.targets if not target.missing]
 
     def _camera_shift(self, frame: np.ndarray) -> np.ndarray:
         """Return by how much the background has moved, in pixels."""
@@ -313,7 +316,7 @@ class AssociationParticleFilter:
         """Return what is observed: detections, and as printed what the confidence maps of known people show first."""
         if not self.as_printed:
             return found
-        known = np.array([box for each in self._targets if (box := each.observe(frame)) is not None]).reshape(-1, 5)
+        known = np.array([box for each in self.targets if (box := each.observe(frame)) is not None]).reshape(-1, 5)
         new = pairwise_overlap(found[:, :4], known[:, :4]).max(axis=1, initial=0) < SAME
         return np.concatenate([known, found[new]])
 
@@ -322,8 +325,8 @@ class AssociationParticleFilter:
         from scipy.optimize import linear_sum_assignment  # takes a second to import
 
         least = PrintedTarget.LEAST if self.as_printed else UNMATCHED
-        self.incidence = np.full((len(observations), len(self._targets)), least)
-        for j, target in enumerate(self._targets):
+        self.incidence = np.full((len(observations), len(self.targets)), least)
+        for j, target in enumerate(self.targets):
             self.incidence[:, j] = np.maximum(target.associate(picture, observations), least)
         if "one to one" in self.additions:
             pairs = zip(*linear_sum_assignment(self.incidence, maximize=True), strict=True)
@@ -334,9 +337,9 @@ class AssociationParticleFilter:
     def _remove(self) -> None:
         """Take leave of those who have disappeared (section 4.2.3 and eq. 10)."""
         lasting = self.remember if "re-finding" in self.additions else self.n_frames
-        for target in self._targets:
+        for target in self.targets:
             target.missing = target.n_absent >= min(self.n_frames, target.trust)
-        self._targets = [each for each in self._targets if each.n_absent < lasting and not self._has_left(each)]
+        self.targets = [each for each in self.targets if each.n_absent < lasting and not self._has_left(each)]
 
     def _has_left(self, target) -> bool:
         """Tell whether somebody has gone out of the picture."""
@@ -353,17 +356,17 @@ class AssociationParticleFilter:
     def _add(self, frame: np.ndarray, picture: Picture, free: np.ndarray, shift: np.ndarray) -> None:
         """Welcome those who were seen in so many frames in a row, and were nobody known (eq. 11)."""
         free = free[free[:, 4] >= self.birth_score]
-        known = np.array([target.box for target in self._targets if not target.missing]).reshape(-1, 4)
+        known = np.array([target.box for target in self.targets if not target.missing]).reshape(-1, 4)
         taken = pairwise_overlap(free[:, :4], known).max(axis=1, initial=0) > TAKEN
         if "parts" in self.additions:
             taken |= _shares_inside(free[:, :4], known).max(axis=1, initial=0) > INSIDE
-        n_needed = PrintedTarget.N_TRAINING if self.as_printed and not self._targets else self.n_frames
+        n_needed = PrintedTarget.N_TRAINING if self.as_printed and not self.targets else self.n_frames
         self._recent = [*self._recent, (frame, free[~taken])][-n_needed:]
         if len(self._recent) < n_needed:
             return
         for boxes in link([found for _, found in self._recent], min_frames=n_needed):
             self._start(boxes, [seen for seen, _ in self._recent], picture, shift)
-        kept = [target.box for target in self._targets if not target.missing]
+        kept = [target.box for target in self.targets if not target.missing]
         self._recent = [(seen, found[~_near(found, kept)]) for seen, found in self._recent]
 
     def _start(self, boxes: dict[int, np.ndarray], frames, picture: Picture, shift: np.ndarray) -> None:
@@ -375,7 +378,7 @@ class AssociationParticleFilter:
             newcomer = PrintedTarget(self._n_born, list(boxes.values()), of_boxes, self, rng)
         else:
             newcomer = _Target(self._n_born, boxes, picture, shift, self, rng)
-        self._targets.append(newcomer)
+        self.targets.append(newcomer)
 
 
 def _near(found, boxes) -> np.ndarray:

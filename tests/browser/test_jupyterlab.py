@@ -107,23 +107,24 @@ def test_the_stack_and_the_live_slider_move(open_notebook):
 
 def test_a_box_is_drawn_with_the_mouse(open_notebook):
     """The first cells of the chapter, with the mouse between them."""
+    from playwright.sync_api import expect
+
     chapter = nbformat.read(ROOT / "notebooks" / "13_your_video.ipynb", as_version=4)
     cells = [cell["source"] for cell in chapter.cells if cell["cell_type"] == "code"]
     last = next(n for n, source in enumerate(cells) if source.startswith("box ="))
-    page = open_notebook([*cells[:last], cells[last]], "video.ipynb")
+    page = open_notebook(cells[: last + 1], "video.ipynb")
     before = page.locator(".jp-OutputArea-output pre", has_text="x, y, width, height")
     before.wait_for()
-    drawn = page.locator(".jp-OutputArea-output .jupyter-widgets img, .jp-OutputArea-output img").first.bounding_box()
-    scale = drawn["width"] / 320
-    wanted = [200.0, 50.0, 60.0, 150.0]
-    x, y, w, h = (scale * side for side in wanted)
+    drawn, wanted = page.get_by_alt_text("annotate me").bounding_box(), [200.0, 50.0, 60.0, 150.0]
+    x, y, w, h = (drawn["width"] / 320 * side for side in wanted)
     page.mouse.move(drawn["x"] + x, drawn["y"] + y)
     page.mouse.down()
     page.mouse.move(drawn["x"] + x + w / 2, drawn["y"] + y + h / 2, steps=5)
     page.mouse.move(drawn["x"] + x + w, drawn["y"] + y + h, steps=5)
     page.mouse.up()
+    old = before.inner_text()
     page.locator(".jp-CodeCell").nth(last).click()
     page.keyboard.press("Control+Enter")
-    page.wait_for_function("old => document.querySelector('.jp-Notebook').innerText.includes('[159') === false", arg="")
+    expect(before).not_to_have_text(old, timeout=30_000)
     found = [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", before.inner_text())]
     assert found == pytest.approx(wanted, abs=3)

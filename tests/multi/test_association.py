@@ -63,7 +63,7 @@ def textured():
 
 
 def test_particles_at_one_place_are_drawn_from_the_product_of_motion_and_detection():
-    (target,) = started(box(100), n_particles=30_000)._targets
+    (target,) = started(box(100), n_particles=30_000).targets
     target.box = np.array([98.0, 77, 20, 70])
     target.states[:] = [110, 116, 24, 72, 3.0, -1.0]
     x, y, w, h = 104.0, 82.0, 26.0, 75.0
@@ -87,7 +87,7 @@ def test_particles_at_one_place_are_drawn_from_the_product_of_motion_and_detecti
 
 def test_steps_and_changes_of_velocity_go_together():
     """Without a detection: x' = x + v + e and v' = v + d, with var(e) = place^2 + speed^2, cov(e, d) = speed^2."""
-    (target,) = started(box(100), n_particles=30_000)._targets
+    (target,) = started(box(100), n_particles=30_000).targets
     target.box = np.array([98.0, 77, 20, 50])
     target.states[:] = [110, 116, 24, 72, 3.0, -1.0]
     target.predict(np.array([2.0, 7.0]))
@@ -109,7 +109,7 @@ def test_without_the_proposal_a_detection_moves_nobody():
 
 @pytest.mark.parametrize(("n_missed", "share_seen", "left"), [(3, 1.0, 1.0), (4, 1.0, 0.9), (0, 0.34, 0.9)])
 def test_who_is_not_found_comes_to_rest(n_missed, share_seen, left):
-    (target,) = started(box(100))._targets
+    (target,) = started(box(100)).targets
     before = target.states.copy()
     target.n_missed, target.share_seen = n_missed, share_seen
     target.predict(np.array([2.0, -1.0]))
@@ -121,7 +121,7 @@ def test_who_is_not_found_comes_to_rest(n_missed, share_seen, left):
 @pytest.mark.parametrize("velocity", [True, False])
 def test_where_looks_tell_nothing_it_is_a_kalman_filter(velocity):
     tracker = started(box(60), n_particles=20_000, additions=ADDITIONS if velocity else without("velocity"))
-    (target,) = tracker._targets
+    (target,) = tracker.targets
     h = 72
     motion, seen = np.array([[1, 1], [0, 1]]), np.array([[1, 0]])
     if not velocity:
@@ -153,7 +153,7 @@ def test_where_looks_tell_nothing_it_is_a_kalman_filter(velocity):
 @pytest.mark.parametrize("detected", [True, False])
 def test_weights_are_prediction_times_looks(textured, product, detected):
     additions = ADDITIONS if product else without("product")
-    (target,) = started(box(100), n_particles=300, frame=textured, additions=additions, sigma=(0.3, 0.2))._targets
+    (target,) = started(box(100), n_particles=300, frame=textured, additions=additions, sigma=(0.3, 0.2)).targets
     picture, usual, looks = Picture(textured), target.usual, copy.deepcopy(target.looks)
     picture.cover([80, 100, 30, 60])
     observation = np.array(box(103, 78)) if detected else None
@@ -194,7 +194,7 @@ def test_weights_are_prediction_times_looks(textured, product, detected):
 def test_the_incidence_matrix_says_how_well_detections_were_predicted(velocity):
     """On a flat picture: the mean of a Gaussian about each particle, per height squared."""
     tracker = started(box(100), n_particles=40, additions=ADDITIONS if velocity else without("velocity"))
-    (target,) = tracker._targets
+    (target,) = tracker.targets
     h = target.box[3]
     detections = np.array([box(100), box(112, 70, 30, 80), box(95, 84, 20, 60)])
     target.predict(np.array([3.0, 0.0]))
@@ -213,7 +213,7 @@ def test_the_incidence_matrix_says_how_well_detections_were_predicted(velocity):
 def test_the_incidence_matrix_says_how_alike_detections_are(textured, product):
     """What is left without the gate; with it, the two are added."""
     additions = ADDITIONS if product else without("product")
-    (target,) = started(box(100), frame=textured, additions=additions)._targets
+    (target,) = started(box(100), frame=textured, additions=additions).targets
     target.shares = np.array([0.3, 0.7])
     picture, detections = Picture(textured), np.array([box(102), box(130), box(10, 150, 20, 60)])
     gated = target.associate(picture, detections)
@@ -247,7 +247,7 @@ def test_the_assignment_has_the_greatest_sum_of_all(n_observations, n_targets):
     for _ in range(10):
         matrix = rng.normal(-8, 5, (n_observations, n_targets))
         tracker = AssociationParticleFilter()
-        tracker._targets = [Column(column) for column in matrix.T]
+        tracker.targets = [Column(column) for column in matrix.T]
         owners = tracker._associate(None, np.zeros((n_observations, 5)))
         np.testing.assert_array_equal(tracker.incidence, np.maximum(matrix, association.UNMATCHED))
         gain = matrix - association.UNMATCHED
@@ -265,7 +265,7 @@ def test_taken_one_by_one_a_detection_may_belong_to_two():
     found = {}
     for additions in (ADDITIONS, without("one to one")):
         tracker = AssociationParticleFilter(additions=additions)
-        tracker._targets = [Column(column) for column in matrix.T]
+        tracker.targets = [Column(column) for column in matrix.T]
         found[len(additions)] = tracker._associate(None, np.zeros((2, 5)))
     assert found == {len(ADDITIONS): {0: 1, 1: 0}, len(ADDITIONS) - 1: {0: 0, 1: 0}}
 
@@ -321,7 +321,7 @@ def test_somebody_new_has_the_velocity_of_the_detections():
     tracker = AssociationParticleFilter(20_000, seed=0)
     for t in range(3):
         tracker.update(FLAT, [box(50 + 4 * t, 80 - t)])
-    states = tracker._targets[0].states
+    states = tracker.targets[0].states
     np.testing.assert_allclose(states.mean(axis=0), [70, 114, 24, 72, 4, -1], atol=0.15)
     expected = [0.06 * 72, 0.06 * 72, 0.05 * 24, 0.05 * 72, 0.03 * 72, 0.03 * 72]
     np.testing.assert_allclose(states.std(axis=0), expected, rtol=0.03)
@@ -342,7 +342,7 @@ def test_who_looks_gone_is_shown_no_more_after_so_many_frames(textured, n_frames
     other = textured[::-1, ::-1].copy()
     shown = [ids(tracker.update(other, [])) for _ in range(n_frames + 4)]
     assert shown == [[1]] * (n_frames - 1) + [[]] * 5
-    assert tracker._targets == []  # and then forgotten
+    assert tracker.targets == []  # and then forgotten
 
 
 @pytest.mark.parametrize("remembered", [True, False])
@@ -353,7 +353,7 @@ def test_forgotten_at_once_without_finding_again(textured, remembered):
     for _ in range(3):
         tracks = tracker.update(textured[::-1, ::-1].copy(), [])
     assert tracks == []
-    assert len(tracker._targets) == remembered
+    assert len(tracker.targets) == remembered
 
 
 @pytest.mark.parametrize(("n_times", "n_believed"), [(3, 0), (12, 2), (40, 9), (100, 17)])
@@ -362,7 +362,7 @@ def test_who_looks_as_usual_is_believed_the_longer_the_oftener_found(n_times, n_
     tracker = started(box(100), n_times=n_times, n_particles=20) if n_times < 4 else started(box(100), n_particles=20)
     for _ in range(n_times - 3):
         tracker.update(FLAT, [box(100)])
-    (target,), absent = tracker._targets, []
+    (target,), absent = tracker.targets, []
     for _ in range(n_believed + 2):
         tracker.update(FLAT, [])
         absent.append(target.n_absent)
@@ -409,7 +409,7 @@ def test_who_walks_out_of_the_picture_has_left(start, velocity, additions):
         tracks = tracker.update(FLAT, [[x, y, w, h, score]] if inside else [])
         if t == 6:
             assert ids(tracks) == [1]
-    assert bool(tracker._targets) == (additions != ADDITIONS)
+    assert bool(tracker.targets) == (additions != ADDITIONS)
 
 
 def test_who_is_not_found_near_the_border_has_left_and_elsewhere_not(textured):
@@ -420,7 +420,7 @@ def test_who_is_not_found_near_the_border_has_left_and_elsewhere_not(textured):
     other = textured[::-1, ::-1].copy()
     for _ in range(3):
         tracker.update(other, [])
-    assert [target.track.id for target in tracker._targets] == [1]
+    assert [target.track.id for target in tracker.targets] == [1]
 
 
 @pytest.mark.parametrize(
@@ -434,7 +434,7 @@ def test_who_is_not_found_near_the_border_has_left_and_elsewhere_not(textured):
 def test_where_the_border_is(x, y, n_absent, left):
     """At once where the centre or the feet are far out; near the sides, 0.3 heights of 72, after three frames."""
     tracker = started(box(150))
-    (target,) = tracker._targets
+    (target,) = tracker.targets
     target.box, target.n_absent = np.array(box(x, y)[:4]), n_absent
     assert tracker._has_left(target) == left
 
@@ -501,7 +501,7 @@ def test_who_is_nearer_covers_who_is_behind(covers):
     left, right = (int(np.floor(edge + 0.5)) for edge in (x + 0.2 * w, x + 0.8 * w))
     rows = [int(np.floor(y + n * h / 3 + 0.5)) for n in range(4)]
     shares = [mask[a:b, left:right].mean() for a, b in itertools.pairwise(rows)]
-    seen = {target.track.id: target.share_seen for target in tracker._targets}
+    seen = {target.track.id: target.share_seen for target in tracker.targets}
     assert seen[near.id] == 1
     assert seen[far.id] == pytest.approx(np.mean([share * (share >= 0.1) for share in shares]))
     assert (seen[far.id] < 1) == covers
@@ -539,7 +539,7 @@ def test_particles_go_along_with_the_background(monkeypatch):
 
 @pytest.mark.parametrize("detected", [True, False])
 def test_who_cannot_be_seen_is_held_unless_detected(detected):
-    (target,), picture = started(box(100))._targets, Picture(FLAT)
+    (target,), picture = started(box(100)).targets, Picture(FLAT)
     picture.cover([0, 0, 320, 240])
     target.update(picture, np.array(box(100)) if detected else None)
     assert target.share_seen < 0.35
@@ -549,14 +549,14 @@ def test_who_cannot_be_seen_is_held_unless_detected(detected):
 
 @pytest.mark.parametrize(("share_seen", "drop", "n_absent"), [(0.36, 0.09, 0), (0.34, 0.09, 3), (0.36, 0.11, 3)])
 def test_it_is_no_absence_to_be_seen_and_look_as_usual(share_seen, drop, n_absent):
-    (target,) = started(box(100))._targets
+    (target,) = started(box(100)).targets
     target.n_found, target.n_absent, target.usual_color, target.share_seen = 40, 2, 0.7, share_seen
     target._miss(0.7 - drop)
     assert (target.n_missed, target.n_absent) == (1, n_absent)
 
 
 def test_what_is_usual_follows_slowly():
-    (target,) = started(box(100))._targets
+    (target,) = started(box(100)).targets
     target.usual, target.usual_color, target.share_seen = -2.0, 0.5, 0.81
     target._find(Picture(FLAT), 0.9, -1.0)
     assert (target.usual, target.usual_color) == (pytest.approx(-1.9), pytest.approx(0.54))
@@ -568,7 +568,7 @@ def test_what_is_usual_follows_slowly():
 @pytest.mark.parametrize("surroundings", [True, False])
 def test_looks_are_of_the_last_detection(textured, surroundings):
     additions = ADDITIONS if surroundings else without("surroundings")
-    (target,) = started(box(100), frame=textured, additions=additions, n_bands=2)._targets
+    (target,) = started(box(100), frame=textured, additions=additions, n_bands=2).targets
     picture, boxes = Picture(textured), [box(103)[:4], box(20)[:4]]
     expected = Looks(picture, box(100)[:4], n_bands=2, surroundings=surroundings).similarities(picture, boxes)
     np.testing.assert_allclose(target.looks.similarities(picture, boxes)[0], expected[0])
@@ -577,11 +577,11 @@ def test_looks_are_of_the_last_detection(textured, surroundings):
 def test_looks_are_learnt_only_from_who_is_seen_well(textured):
     people = [box(100, 80), box(106, 94)]
     tracker = started(*people, frame=textured)
-    before = [(target.looks._inside.copy(), target.usual, target.n_found) for target in tracker._targets]
+    before = [(target.looks._inside.copy(), target.usual, target.n_found) for target in tracker.targets]
     grain = np.random.default_rng(1).integers(0, 9, textured.shape, dtype=np.uint8)
     tracker.update(textured + grain, people)
     learnt = []
-    for target, (inside, usual, n_found) in zip(tracker._targets, before, strict=True):
+    for target, (inside, usual, n_found) in zip(tracker.targets, before, strict=True):
         assert target.n_found == n_found + 1
         assert (target.usual != usual) == (np.abs(target.looks._inside - inside).max() > 1e-6)
         learnt.append((target.box[1] > 87, target.share_seen > 0.8, target.usual != usual))
@@ -637,7 +637,7 @@ def test_the_same_seed_gives_the_same_and_another_does_not():
 
 def test_fields_of_a_track():
     tracker = started(box(100), box(200), n_particles=25)
-    newborn = started(box(100))._targets[0].track
+    newborn = started(box(100)).targets[0].track
     assert (newborn.particles, newborn.weights, newborn.score) == (None, None, 1.0)
     for number, track in enumerate(tracker.update(FLAT, [box(100), box(200)]), start=1):
         assert track.id == number
@@ -686,7 +686,7 @@ def test_known_people_are_followed_from_the_next_frame_on(as_printed):
     tracker = AssociationParticleFilter(60, seed=0, as_printed=as_printed)
     tracker.init(list(scene.frames[:5]), boxes)
     if not as_printed:
-        velocities = [target.states[:, 4].mean() for target in tracker._targets]
+        velocities = [target.states[:, 4].mean() for target in tracker.targets]
         assert velocities == pytest.approx([scene.frames.walkers[n].velocity[0] for n in (0, 1)], abs=0.8)
     tracks = tracker.update(scene.frames[5], truth_of(scene, 5))
     assert ids(tracks) == [1, 2]
