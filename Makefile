@@ -28,7 +28,7 @@ lab: $(VENV)/ready
 bench: benchmarks/.venv/ready
 	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/speed.py $(ARGS)
 	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/clustering.py
-	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/association.py
+	PYTHONPATH=. benchmarks/.venv/bin/python benchmarks/association.py --published
 
 clean:
 	rm -rf _build $(VENV) benchmarks/.venv *.egg-info .pytest_cache .ruff_cache .coverage

@@ -1,11 +1,11 @@
-"""Sliders that work without a kernel, without a network and without Python: a picture for every position, made before.
+"""Sliders that work without Python and without a network: a picture for every position, made beforehand.
 
 A function that draws a picture for given values becomes a stack of pictures under one, two or three sliders:
 
     explore(draw, n_particles=[10, 25, 50])
 
 The stack is part of the page, so that the built book and a notebook that nobody runs can be played with. Somebody who
-has a kernel gets any value in between from ``.live()``, which calls the same function. Every chapter has at least one.
+has a kernel gets any number in between from ``.live()``, which calls the same function. Every chapter has at least one.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Slider:
         return 0 if self.start is None else self.values.index(self.start)
 
     def text(self, value) -> str:
-        """Return a value as it is shown, broken numbers to six digits, with the unit."""
+        """Return a value as it is shown, fractions to six significant digits, with the unit."""
         return f"{f'{value:g}' if isinstance(value, float) else value} {self.unit}".strip()
 
     def control(self):
@@ -182,7 +182,7 @@ class Explorer:
         )
 
     def live(self):
-        """Return sliders of ipywidgets that call the function for any value in between; they need a kernel.
+        """Return sliders of ipywidgets that call the function for any number in between; they need a kernel.
 
         Returns
         -------

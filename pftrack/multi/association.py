@@ -35,7 +35,7 @@ from collections.abc import Collection
 import numpy as np
 
 from pftrack import motion, patches, smc
-from pftrack.checks import check_box, check_picture, check_same_size, check_seed
+from pftrack.checks import check_picture, check_same_size, check_seed
 from pftrack.detection import PedestrianDetector
 from pftrack.metrics import pairwise_overlap
 from pftrack.multi.base import Track, check_detections, check_training, link, stream
@@ -129,6 +129,12 @@ AT_MOST = 18
 
 BORDER = 0.3
 """Distance from the sides of the picture, in heights, in which who is not found has left."""
+
+BEYOND = {"sides": 0.05, "top": 0.9, "bottom": 0.4}
+"""How far the middle of somebody may be beyond the sides, the head above and the feet below, in heights of a box."""
+
+HEAD_ROOM, FEET_ROOM = 10, 2
+"""Whose head is lower than so many pixels above the lower edge has left; whose feet are, is at the edge."""
 
 INSIDE = 0.6
 """Share of a detection that must lie in another box to be a part of it."""
@@ -255,8 +261,6 @@ class AssociationParticleFilter:
         known = check_training(frames, boxes)
         if not all(len(frames) - 1 in of_one for of_one in known):
             raise ValueError("a target is hidden in the last training frame, so nobody knows where it is")
-        for of_one in known:
-            check_box(of_one[len(frames) - 1], frames[-1])
         self._shape, self.targets, self._n_born, self._recent = frames[-1].shape, [], 0, []
         self._camera_shift(frames[-1])
         picture = Picture(frames[-1])
@@ -348,9 +352,9 @@ class AssociationParticleFilter:
         height, width = self._shape[:2]
         x, y, w, h = target.box
         center = x + w / 2
-        across = -0.05 * h <= center <= width + 0.05 * h
-        down = -0.9 * h <= y <= height - 10 and target.feet <= height + 0.4 * h
-        at_the_edge = not BORDER * h <= center <= width - BORDER * h or target.feet > height - 2
+        across = -BEYOND["sides"] * h <= center <= width + BEYOND["sides"] * h
+        down = -BEYOND["top"] * h <= y <= height - HEAD_ROOM and target.feet <= height + BEYOND["bottom"] * h
+        at_the_edge = not BORDER * h <= center <= width - BORDER * h or target.feet > height - FEET_ROOM
         return not (across and down) or (at_the_edge and target.n_absent >= self.n_frames)
 
     def _add(self, frame: np.ndarray, picture: Picture, free: np.ndarray, shift: np.ndarray) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from pftrack import patches
-from pftrack.checks import check_picture, check_same_size
+from pftrack.checks import check_box, check_picture, check_same_size
 from pftrack.detection import merge
 from pftrack.metrics import pairwise_overlap
 
@@ -116,7 +116,7 @@ def check_training(frames, boxes) -> list[dict[int, np.ndarray]]:
     Raises
     ------
     ValueError
-        If there are no frames or targets, a frame is unusable, or a target is never seen.
+        If there are no frames or targets, a frame or a box is unusable, or a target is never seen.
     """
     boxes = np.asarray(boxes, dtype=float)
     if len(frames) == 0 or boxes.ndim != 3 or boxes.shape[::2] != (len(frames), 4) or boxes.shape[1] == 0:
@@ -125,7 +125,10 @@ def check_training(frames, boxes) -> list[dict[int, np.ndarray]]:
         )
     for frame in frames:
         check_same_size(check_picture(frame).shape, frames[0].shape)
-    known = [{t: box for t, box in enumerate(of_one) if np.isfinite(box).all()} for of_one in boxes.swapaxes(0, 1)]
+    known = [
+        {t: check_box(box, frames[t]) for t, box in enumerate(of_one) if not np.isnan(box).any()}
+        for of_one in boxes.swapaxes(0, 1)
+    ]
     if not all(known):
         raise ValueError("a target is hidden in all training frames, so nothing can be learnt of it")
     return known

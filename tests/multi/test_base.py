@@ -128,3 +128,14 @@ def test_detections_are_what_they_were():
 def test_detections_that_are_none_are_refused(detections):
     with pytest.raises(ValueError, match="detections must be rows"):
         base.check_detections(detections)
+
+
+def test_every_training_box_is_checked_and_not_only_the_last():
+    frames = [np.zeros((60, 80, 3), dtype=np.uint8)] * 3
+    boxes = np.tile([10.0, 10.0, 20.0, 30.0], (3, 2, 1))
+    boxes[1, 0] = np.nan  # hidden
+    assert [sorted(known) for known in base.check_training(frames, boxes)] == [[0, 2], [0, 1, 2]]
+    for wrong in ([200, 10, 20, 30], [10, 10, 0, 30], [10, 10, np.inf, 30]):
+        boxes[1, 1] = wrong
+        with pytest.raises(ValueError, match="box"):
+            base.check_training(frames, boxes)
