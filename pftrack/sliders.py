@@ -192,7 +192,7 @@ class Explorer:
         Raises
         ------
         ImportError
-            If ipywidgets is not installed.
+            If ipywidgets is not installed; ``pip install "pftrack[notebook]"`` does it.
         """
         import ipywidgets
         from IPython.display import HTML, display
