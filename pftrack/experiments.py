@@ -26,7 +26,10 @@ import importlib.metadata
 import importlib.util
 import inspect
 import itertools
+import multiprocessing
 import os
+import signal
+import threading
 import time
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -313,8 +316,16 @@ def _groups(runs: Sequence[Run], size: int) -> list[list[Run]]:
     return [group[n : n + size] for group in alike.values() for n in range(0, len(group), size)]
 
 
+def _leave_interrupts_to_the_caller() -> None:
+    """Ignore Ctrl-C in a worker process: the caller gets it too, and ends its workers, who would only complain."""
+    in_worker = multiprocessing.current_process().name != "MainProcess"
+    if in_worker and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _run_group(runs: Sequence[Run], library: str) -> dict[Run, np.ndarray]:
     """Run trackers of equal settings side by side on one pass through the film; done by a worker."""
+    _leave_interrupts_to_the_caller()
     if library != LIBRARY:
         raise ValueError(
             "a worker has another version of pftrack, NumPy, OpenCV or numba than the caller, so their results could "
