@@ -27,8 +27,9 @@ TABLES = {"owczarek-2015": range(1, 3), "li-2012": range(1, 4), "li-2016": range
 ANCHORS = [
     *(f"{paper}-fig-{figure}" for paper, figures in FIGURES.items() for figure in figures),
     *(f"{paper}-table-{table}" for paper, tables in TABLES.items() for table in tables),
+    "li-2016-alg-1",
 ]
-"""Every figure and table of the papers, by the anchor it has in some page."""
+"""Every figure and table of the papers, and the one algorithm, by the anchor it has in some page."""
 
 MEGABYTE = 1_000_000
 PAGE, NOTEBOOK, SITE = 3 * MEGABYTE, 2 * MEGABYTE, 40 * MEGABYTE

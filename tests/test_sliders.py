@@ -460,7 +460,7 @@ def test_without_ipywidgets_there_are_pages_but_no_live_sliders(monkeypatch):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# What was wrong once
+# Values, figures and functions of other kinds
 # ---------------------------------------------------------------------------------------------------------------------
 
 
